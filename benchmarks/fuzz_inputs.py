@@ -125,9 +125,9 @@ num_frames=3
 material.density=0.3
 losses=default
 refine=5
-export=[rg]
+metrics={fields:[rg]}
 betas=[1.5,0,-1]
-cloth_friction=0.5
+cloth_contact={friction:0.5}
 solver.max_iterations=7"""
 #: What a run leaves about its settings, in a few lines.
 _RECORD = b"""seed: 0

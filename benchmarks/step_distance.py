@@ -59,7 +59,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "quickstart+5": {"checkpoint": "quickstart", "refine": 5},
     "guess+5": {"stepper": "refine", "refine": 5},
     "newton, 3 iterations": {"stepper": "newton", "solver": {"max_iterations": 3}},
-    "6 sweeps": {"stepper": "refine", "refine": 6, "refine_method": "sweeps"},
+    "6 sweeps": {"stepper": "refine", "refine": {"goal": 6, "method": "sweeps"}},
 }
 
 

@@ -18,10 +18,11 @@ from tqdm import tqdm
 from hood.app.common import load_stepper
 from hood.app.notices import Bar, Item, collected, tell_how_far
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
-from hood.app.plan_file import plan_mode, plan_path, planned, rollout_config
+from hood.app.plan_file import plan_accuracy, plan_mode, plan_path, planned, rollout_config
 from hood.app.scene.motion import NAMED, Own
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.python_words import overrides
+from hood.app.settings.tables import measurement
 from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.app.stepping.guarding import GuardStopped, make_guard
@@ -76,16 +77,16 @@ class Simulation:
         with collected() as told:
             guard = make_guard(config, self.stepper, self.potential)
         self.notes += [line for line in told if line not in self.notes]
-        settle, relaxing = start_of(config)
+        measured, (settle, relaxing) = measurement(config), start_of(config)
         steps = frames.simulate(
             self.stepper,
             self.scene,
             self.potential,
             self._simulated,
             relaxing,
-            metrics=str(config.metrics),
-            fields=tuple(config.export),
-            surface_stride=int(config.surface_stride),
+            metrics=measured.kind,
+            fields=measured.fields,
+            surface_stride=measured.surface_every,
             settle=settle,
             guard=guard,
             afresh=plan_mode(config) == "full",
@@ -145,10 +146,11 @@ def simulate(
     else:
         require_stepper(stepper)
         named["stepper"] = "network"  # what may be said of a network's steps may be said of these
-    key = "accuracy" if named.get("accuracy") is not None else "plan" if plan_path(named) is not None else None
+    plans = plan_path(named) is not None or plan_accuracy(named) is not None
+    key = "accuracy" if named.get("accuracy") is not None else "plan" if plans else None
     if key is not None and (own != NAMED or not isinstance(stepper, str)):
         raise ConfigError(f"{key}={named[key]}: a plan names garment, body, sequence, material and stepper; leave them out")
-    if key == "plan":  # then what is not said is the plan's
+    if plan_path(named) is not None:  # then what is not said is the plan's
         usual = {key: parameter.default for key, parameter in inspect.signature(simulate).parameters.items()}
         named = {key: value for key, value in named.items() if usual.get(key) != value}
     notes: list[str] = []

@@ -32,7 +32,7 @@ SCENES = {
     "trousers_in_two_fabrics": "garment=trousers sequence=plie betas=[1.5,-1] size={below_waistband:1.05} "
     "fabrics={below_left_knee:silk}",
     "outfit": "garment=[tank,skirt] sequence=walk_proud",
-    "folds_apart": "garment=longsleeve sequence=squats cloth_contact=on cloth_friction=0.3",
+    "folds_apart": "garment=longsleeve sequence=squats cloth_contact={mode:on,friction:0.3}",
     "jacket_opens": "garment=jacket sequence=walk_proud events=[{frame:4,open:front_zip}]",
 }
 #: What takes its steps.
@@ -41,13 +41,13 @@ METHODS = {
     "network_compiled": "stepper=network refine=0 kernels=compiled",
     "network_fused": "stepper=network refine=0 kernels=fused",
     "refined": "stepper=refine refine=5 kernels=torch guard=repair",
-    "swept": "stepper=refine refine=4 refine_method=sweeps kernels=torch",
+    "swept": "stepper=refine refine={goal:4,method:sweeps} kernels=torch",
     "newton_torch": "stepper=newton solver.engine=torch",
     "newton_compiled": "stepper=newton solver.engine=compiled",
     "newton_direct": "stepper=newton solver.linear=direct",
     "guess": "stepper=guess",
 }
-_ROLLOUT = "num_frames=8 video=none sheet=false allow_unsound=true export=[rg] seed=3"
+_ROLLOUT = "num_frames=8 video=none sheet=false allow_unsound=true metrics={fields:[rg]} seed=3"
 _TRAINING = "trainer.iterations=20 trainer.statistics_iterations=4 trainer.log_every=5 trainer.workers=0 trainer.kernels=torch"
 #: In the names of results that are times [ms], [s], or made of them [1/s].
 _TIMES = ("ms_", "seconds", "per_second")

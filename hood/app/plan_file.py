@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shlex
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +23,7 @@ from omegaconf import DictConfig
 
 from hood import plugins
 from hood.app.settings.compose import ConfigError, load_config, named_today
+from hood.app.settings.tables import refinement
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import locate
@@ -29,7 +31,7 @@ from hood.rollouts.verdict.frames import name_frames
 from hood.steppers.watched import PLAN_METRICS
 
 #: Words of these keys name files whose content decides.
-_FILES = ("garment", "sequence", "body", "checkpoint", "pins", "refine_table")
+_FILES = ("garment", "sequence", "body", "checkpoint", "pins")
 #: Of larger files [bytes] the size alone is looked at.
 _LARGE = 1 << 26
 
@@ -42,8 +44,8 @@ def content_digest(words: Sequence[str]) -> str:
     """
     said = hashlib.sha256("\0".join(sorted(words)).encode())
     config = load_config("rollout", words)
-    for key in _FILES:
-        for name in config[key] if isinstance(config[key], Sequence) and not isinstance(config[key], str) else [config[key]]:
+    for key, value in [*((key, config[key]) for key in _FILES), ("refine", refinement(config).table)]:
+        for name in value if isinstance(value, Sequence) and not isinstance(value, str) else [value]:
             said.update(f"\0{key}".encode())
             for part in _content_of(key, str(name)):
                 said.update(part)
@@ -76,19 +78,30 @@ FORMAT = "hood-plan/1"
 _LIMIT = 1 << 20
 #: Keys that say nothing about the model, so they may be given beside a plan.
 FREE = (
-    "output", "num_frames", "guard", "fail_on", "resume", "metrics", "surface_stride", "export", "colour",
-    "thin_body", "video", "sheet", "output_fps", "refine_mesh", "formats", "texture",
+    "output", "num_frames", "guard", "fail_on", "resume", "metrics", "colour", "thin_body",
+    "video", "sheet", "output_fps", "refine_mesh", "formats", "texture",
 )  # fmt: skip
 
 
 #: Values of ``plan`` that name no file; null, as older records have it, is the first.
 _MODES = ("auto", "full")
+#: An accuracy that ``plan`` asks for: a γ, or a length.
+_ACCURACY = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)? ?([mc]?m)?")
 
 
 def plan_path(config: Mapping[Any, Any]) -> Path | None:
-    """The file that ``plan`` names; None for ``auto`` and ``full``."""
+    """The file that ``plan`` names; None for ``auto``, ``full`` and an accuracy."""
     asked = config.get("plan")
-    return None if asked is None or str(asked) in _MODES else Path(str(asked)).expanduser()
+    return None if asked is None or str(asked) in _MODES or _is_accuracy(asked) else Path(str(asked)).expanduser()
+
+
+def plan_accuracy(config: Mapping[Any, Any]) -> str | None:
+    """The accuracy that ``plan`` asks for; None where it asks for none."""
+    return str(config["plan"]) if _is_accuracy(config.get("plan")) else None
+
+
+def _is_accuracy(asked: Any) -> bool:
+    return asked is not None and _ACCURACY.fullmatch(str(asked)) is not None
 
 
 def plan_mode(config: Mapping[Any, Any]) -> str:
@@ -104,14 +117,16 @@ def key_of(word: str) -> str:
 
 
 def without_accuracy(overrides: Sequence[str]) -> list[str]:
-    """The words of the full model of a rollout that may plan first."""
-    return [word for word in overrides if key_of(word) != "accuracy"]
+    """The words of the full model of a rollout that may plan first, by today's keys."""
+    return [word for word in named_today(overrides) if key_of(word) != "plan" or not _is_accuracy(word.partition("=")[2])]
 
 
 def planned(overrides: Sequence[str]) -> list[str]:
-    """The words of a rollout; with ``accuracy`` its plan stands in them, see :func:`hood.studies.plan.plan.planned`."""
+    """The words of a rollout; where ``plan`` is an accuracy its plan stands in them, see
+    :func:`hood.studies.plan.plan.planned`."""
+    overrides = list(named_today(overrides))
     if len(without_accuracy(overrides)) == len(overrides):
-        return list(overrides)
+        return overrides
     words: list[str] = plugins.find("planners", "accuracy")(overrides)
     return words
 
@@ -125,8 +140,6 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
     overrides = named_today(overrides)
     config = load_config("rollout", overrides)
     path = plan_path(config)
-    if config.accuracy is not None:
-        raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto; a plan has its own, drop accuracy=…")
     if path is None:
         return config
     words = _checked_words(path)

@@ -25,6 +25,7 @@ from hood.app.scene.events import describe_held, fastening_attributes, summarise
 from hood.app.scene.garments import describe_ease, summarise_ease
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
+from hood.app.settings.tables import measurement
 from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double, start_of
 from hood.app.stepping.automatic import advice
 from hood.app.stepping.cautions import idle_in_rollout, warn
@@ -225,7 +226,7 @@ def _simulate_to_disk(
     and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
-    settle, relaxing = start_of(config)
+    measured, (settle, relaxing) = measurement(config), start_of(config)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
         say(f"{scene.motion.name} has {count} frames at {1 / scene.dt:g} fps; the rollout ends there")
@@ -239,7 +240,7 @@ def _simulate_to_disk(
         "stepper": str(config.stepper),
         "garment": scene.garment.name,
         "sequence": scene.motion.name,
-        "surface_stride": int(config.surface_stride),
+        "surface_stride": measured.surface_every,
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
         "doubts": [doubt.as_dict() for doubt in doubts],
@@ -260,7 +261,7 @@ def _simulate_to_disk(
         ridden_faces(garment.faces if finer is None else finer.faces, len(stored_rest), riders),
         scene.motion.faces,
         scene.motion.num_vertices,
-        metric_names(potential, stepper, str(config.metrics), settle, guard is not None),
+        metric_names(potential, stepper, measured.kind, settle, guard is not None),
         scene.dt if steps is None else 1.0 / steps.rate.fps,
         attributes,
         farthest=float(np.abs(scene.motion.translation).max()),
@@ -276,9 +277,9 @@ def _simulate_to_disk(
         potential,
         count,
         relaxing,
-        metrics=str(config.metrics),
+        metrics=measured.kind,
         fields=exported(config),
-        surface_stride=int(config.surface_stride),
+        surface_stride=measured.surface_every,
         settle=settle,
         guard=guard,
         afresh=plan_mode(config) == "full",

@@ -20,13 +20,15 @@ from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
 from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
-from hood.app.settings.compose import ConfigError, load_config, require_choice
+from hood.app.settings.compose import ConfigError, brief, load_config, require_choice
+from hood.app.settings.tables import measurement
 from hood.app.stepping.automatic import Choice, choose, decided
 from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
 from hood.app.stepping.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
 from hood.app.stepping.guarding import check_guard
 from hood.app.stepping.refinement import AUTO, check_refinement, chosen, refined
 from hood.app.stepping.steppers import PLAIN, losses_of, make_network, make_solver, option_of
+from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.energies.potential import Potential
 from hood.model.kernels.block import KERNELS
@@ -58,7 +60,7 @@ def check_config(config: DictConfig) -> None:
     """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
     require_device(config)
     video_of(config)
-    require_choice(config, "metrics", METRIC_CHOICES)
+    _check_metrics(config)
     start_of(config)
     require_choice(config, "fail_on", FAIL_ON)
     _check_numbers(config)
@@ -199,8 +201,16 @@ def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Calla
         tell(f"settle=paper: {reason}")
 
 
+def _check_metrics(config: DictConfig) -> None:
+    asked = measurement(config)
+    if asked.kind not in METRIC_CHOICES:
+        raise ConfigError(unknown("metrics", asked.kind, METRIC_CHOICES))
+    if asked.surface_every < 1:
+        raise ConfigError(f"metrics={brief(config.metrics)}: surface_every is {asked.surface_every}; it must be at least 1")
+
+
 def _check_numbers(config: DictConfig) -> None:
-    for key, least in (("num_frames", 1), ("surface_stride", 1), ("seed", 0)):
+    for key, least in (("num_frames", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     thinning(config)

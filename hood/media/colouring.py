@@ -118,7 +118,7 @@ def colouring_of(data: RolloutData, colour: str, beside: Sequence[RolloutData] =
 
 def _residual(data: RolloutData) -> np.ndarray:
     if "rg" not in data.fields:
-        raise ValueError("colour=rg: the rollout has no cloth/rg; simulate it with export=[rg]")
+        raise ValueError("colour=rg: the rollout has no cloth/rg; simulate it with metrics={fields:[rg]}")
     return data.fields["rg"].astype(np.float64)
 
 

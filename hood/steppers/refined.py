@@ -97,7 +97,7 @@ class RefinedStepper:
         settings: NewtonSettings | None = None,
     ) -> None:
         if method not in METHODS:
-            raise ValueError(f"refine_method is {method!r}; choose {' or '.join(METHODS)}")
+            raise ValueError(f"method is {method!r}; choose {' or '.join(METHODS)}")
         self.inner, self.potential, self.goal, self.method = inner, potential, goal, method
         self._fresh_goal = deepcopy(goal)
         self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)

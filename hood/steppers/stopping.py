@@ -79,7 +79,7 @@ def _nearest_rows(path: Path, method: str, field: str, num_vertices: int) -> lis
         if _method(path, i, row) == method
     ]
     if not rows:
-        raise ValueError(f"{path}: has no row of method {method!r}; leave refine_table out to adapt online alone")
+        raise ValueError(f"{path}: has no row of method {method!r}; leave the table out to adapt online alone")
     nearest = min(max(vertices / num_vertices, num_vertices / vertices) for vertices, *_ in rows)
     return [(k, value) for vertices, k, value in rows if max(vertices / num_vertices, num_vertices / vertices) == nearest]
 

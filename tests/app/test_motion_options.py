@@ -24,7 +24,7 @@ def test_defaults_of_the_config_are_those_of_the_code() -> None:
 def test_every_key_reaches_the_options() -> None:
     words = (
         "fps=25 up=y file_fps=90 start=10f stop=2.5 loop=3 blend_in=[0.5,a] betas=[1,-2.5] gender=male hands=file "
-        "unit=0.01 animation=Walk body_parts=[Body,Shoes] num_frames=7"
+        "unit=0.01 animation=Walk objects={body:[Body,Shoes]} num_frames=7"
     )
     expected = MotionOptions(
         fps=25.0, up="y", file_fps=90.0, start="10f", stop=2.5, loop=3, blend_in=0.5, blend_from="a", betas=[1, -2.5],
@@ -38,7 +38,7 @@ def test_every_key_reaches_the_options() -> None:
 
 
 @pytest.mark.parametrize(
-    "word", ["file_fps=fast", "blend_in=[]", "betas=all", "betas=[true]", "body_parts=Body", "unit=x", "unit=true"]
+    "word", ["file_fps=fast", "blend_in=[]", "betas=all", "betas=[true]", "objects={body:Body}", "unit=x", "unit=true"]
 )
 def test_values_of_the_wrong_kind_name_the_key(word: str) -> None:
     with pytest.raises(ConfigError, match=f"{word.split('=')[0]}="):

@@ -27,7 +27,14 @@ def test_layers_that_are_not_the_garments_are_refused(given: object) -> None:
 @pytest.mark.parametrize("keys", [("stepper=newton",), ("stepper=refine", "refine=5", "layers=[trousers,tshirt]")])
 def test_an_outfit_starts_and_stays_apart(keys: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    common = ("garment=[tshirt,trousers]", "num_frames=6", f"output={out}", "video=none", "sheet=false", "surface_stride=1")
+    common = (
+        "garment=[tshirt,trousers]",
+        "num_frames=6",
+        f"output={out}",
+        "video=none",
+        "sheet=false",
+        "metrics={surface_every:1}",
+    )
     assert main(["rollout", *common, *keys]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["surface"]["garment_crossings"]["worst"] == 0

@@ -24,7 +24,7 @@ NETWORK = ["checkpoint=untrained", "model=small", "model.latent_dim=4", "model.s
 SOLVED = {
     "newton": ["stepper=newton", "solver.target_rg=1e-3"],
     "guess": ["stepper=refine", "refine=8"],
-    "sweeps": ["stepper=refine", "refine=4", "refine_method=sweeps"],
+    "sweeps": ["stepper=refine", "refine={goal:4,method:sweeps}"],
     "network": [*NETWORK, "refine=0.01rg"],
     "fixed": [*NETWORK, "model.features=paper", "model.output=acceleration", "step=fixed", "refine=5"],
 }
@@ -81,7 +81,7 @@ def test_why_the_solver_stopped(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_why_refinements_stopped(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*ROLLOUT, "stepper=refine", "refine=0.5rg", "refine_most=30"]) == 0
+    assert main([*ROLLOUT, "stepper=refine", "refine={goal:0.5rg,most:30}"]) == 0
     assert "frames met it" in capsys.readouterr().out
     assert json.loads(Path("out/summary.json").read_text())["refinement"]["steps_ended"] == {"stopped": 4}
     assert main([*ROLLOUT, "stepper=refine", "refine=2", "fail_on=nothing"]) == 0

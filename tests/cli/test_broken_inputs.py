@@ -57,7 +57,7 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
         None,
     ),
     "formats in braces": (["rollout", "formats={a:1}"], ("formats={a:1}: give a list in brackets", "formats=[]"), None),
-    "exported values": (["rollout", "export=[strain]"], ("export=[strain]", "give some of [rg]"), None),
+    "exported values": (["rollout", "metrics={fields:[strain]}"], ("strain", "give some of [rg]"), None),
     "energy that another one needs": (
         ["rollout", "losses.terms.collision=null"],
         ("losses.terms.friction takes values from it", "friction=null as well"),

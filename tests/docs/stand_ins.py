@@ -81,7 +81,7 @@ class Desk:
 
     def rollout(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
-            drawn = ["num_frames=12", "video=none", "sheet=false", "export=[rg]"]
+            drawn = ["num_frames=12", "video=none", "sheet=false", "metrics={fields:[rg]}"]
             assert main(["rollout", "garment=dress", "stepper=guess", *drawn, "fail_on=nothing", "output=made"]) == 0
 
         made = self._once("rollout", make) / "made"

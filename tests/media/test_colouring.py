@@ -97,7 +97,7 @@ def test_colours_get_darker_and_the_unknown_is_grey(data: RolloutData) -> None:
 
 
 def test_what_cannot_be_shown_is_refused(data: RolloutData) -> None:
-    with pytest.raises(ValueError, match=r"no cloth/rg; simulate it with export=\[rg\]"):
+    with pytest.raises(ValueError, match=r"no cloth/rg; simulate it with metrics={fields:\[rg\]}"):
         colouring_of(replace(data, fields={}), "rg")
     with pytest.raises(ValueError, match="colour is 'heat'; choose none, strain, rg or contact"):
         colouring_of(data, "heat")

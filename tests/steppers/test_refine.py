@@ -201,7 +201,7 @@ def test_names_and_choices() -> None:
     assert stepper.times == ("search", "features", "network", "refine", "rest", "total")
     assert unrefined(stepper) is inner
     assert unrefined(inner) is inner
-    with pytest.raises(ValueError, match="refine_method is 'jacobi'"):
+    with pytest.raises(ValueError, match="method is 'jacobi'"):
         RefinedStepper(inner, POTENTIAL, Count(1), "jacobi")
 
 

@@ -231,7 +231,7 @@ def read_checked(path: Path, colour: str) -> RolloutData:
     if len(data.time) == 0:
         raise ValueError(f"{path}: holds no frames; run hood rollout again")
     if colour == "rg" and "rg" not in data.fields:
-        raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with export=[rg]")
+        raise ValueError(f"{path}: colour=rg needs cloth/rg, which is missing; simulate it with metrics={{fields:[rg]}}")
     if colour == "contact" and not len(data.body_faces):
         raise ValueError(f"{path}: colour=contact shows the distance from the body, and the rollout has none")
     return data

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, brief, plain, require_choice
+from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.app.settings.tables import objects
 from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.said import Doubt
 from hood.assets.fitting.suspicions import suspect_seams
@@ -101,7 +102,7 @@ def wanted_of(config: DictConfig) -> Wanted:
     require_choice(config, "small_parts", SMALL_PARTS)
     weld = plain(config.weld)
     return Wanted(
-        objects=tuple(_names(config.objects)),
+        objects=tuple(map(str, objects(config).garment)),
         sew=weld != NONE,
         gap=None if weld in (AUTO, NONE) else _metres(weld),
         shells=str(config.shells),
@@ -121,14 +122,6 @@ def words_of(wanted: Wanted) -> list[str]:
         "small_parts": None if wanted.small_parts == usual.small_parts else f"small_parts={wanted.small_parts}",
     }
     return [word for word in words.values() if word is not None]
-
-
-def _names(given: Any) -> list[str]:
-    value = plain(given)
-    names = value if isinstance(value, list) else [value]
-    if not all(isinstance(name, (str, int, float)) and not isinstance(name, bool) for name in names):
-        raise ConfigError(f"objects={brief(value)}: give names of objects, groups, materials or parts, objects=[tank,part_2]")
-    return [str(name) for name in names]
 
 
 def _metres(value: Any) -> float:

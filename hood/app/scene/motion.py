@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
+from hood.app.settings.tables import objects
 from hood.assets.body.body import Body, body_part
 from hood.assets.files.library import names
 from hood.assets.garment.garment import Garment
@@ -171,7 +172,7 @@ def motion_options(config: DictConfig) -> MotionOptions:
         trans_unit=_unit(config)[0],
         scale=_unit(config)[1],
         animation=config.animation,
-        parts=_names(config, "body_parts"),
+        parts=[str(name) for name in objects(config).body],
     )
 
 
@@ -221,10 +222,3 @@ def _betas(given: Any) -> Any:
     if not isinstance(given, list) or not all(isinstance(b, (int, float)) and not isinstance(b, bool) for b in given):
         raise ConfigError(f"betas={brief(given)}: give at most 10 finite shape coefficients, e.g. betas=[1.5,0,-1]")
     return given
-
-
-def _names(config: DictConfig, key: str) -> list[str]:
-    given = plain(config[key])
-    if not isinstance(given, list):
-        raise ConfigError(f"{key}={brief(given)}: give a list of names, e.g. {key}=[Body]")
-    return [str(name) for name in given]

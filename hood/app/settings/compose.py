@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.settings.old_keys import todays_words
 from hood.app.settings.old_targets import rename_targets
-from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable
+from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable, require_braces
 from hood.assets.files.library import unknown
 from hood.plugins import config_folders, packages, without_options
 
@@ -29,7 +29,7 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 #: Keys that take a table of parts, some beside numbers and lists.
-TABLES = ("size", "size_end", "fabrics")
+TABLES = ("size", "size_end", "fabrics", "refine", "metrics", "cloth_contact", "objects")
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself.
@@ -47,7 +47,7 @@ _REASON = 300
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
-_REFINING = ("refine", "refine_method", "refine_most", "refine_table")
+_REFINING = ("refine",)
 #: Keys that people look for under another word.
 _OTHER_WORDS = {
     "motion": ("sequence", "sequences"),
@@ -146,7 +146,8 @@ def _with_keys(known: DictConfig, keys: Sequence[Override]) -> DictConfig | None
         for override in keys:
             if override.type is not OverrideType.CHANGE or override.is_sweep_override() or override.package is not None:
                 return None
-            OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+            key = override.key_or_group
+            OmegaConf.update(config, key, override.value(), merge=key not in TABLES)
     except OmegaConfBaseException:
         return None
     return config
@@ -271,6 +272,7 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
 def _read_word(text: str, defaults: DictConfig) -> tuple[str, Override]:
     """A word in the form that Hydra reads, see :func:`hood.app.settings.overrides.readable`, and what it says."""
     try:
+        require_braces(text, TABLES)
         text = readable(text, _takes_several(text.partition("=")[0], defaults)) if "=" in text else text
         return text, parse(text)
     except ValueError as error:
@@ -313,7 +315,7 @@ def _check_brackets(name: str, override: Override, known: DictConfig) -> None:
     """Refuse a table where a list is wanted; Hydra would not say so."""
     key, value = override.key_or_group, override.value()
     before = OmegaConf.select(known, key, default=None)
-    if isinstance(before, ListConfig) and isinstance(value, dict):
+    if isinstance(before, ListConfig) and isinstance(value, dict) and key not in TABLES:
         raise ConfigError(_wrong_kind(name, key, before, decoded(value)))
 
 

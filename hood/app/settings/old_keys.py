@@ -14,6 +14,7 @@ from hood.assets.files.said import say
 
 #: Values of then that mean nothing else than what is usual.
 _SPEED, _SECONDS = 0.25, 2.0
+_USUAL = "it is what is usual"
 
 
 class _Old(NamedTuple):
@@ -87,6 +88,21 @@ def _goal(unit: str, times: int = 1) -> Callable[[Any, Mapping[str, Any]], Any]:
     return refine
 
 
+def _part(key: str, first: str, part: str, usual: Any) -> Callable[[Any, Mapping[str, Any]], Any]:
+    """For what is a part of the table of ``key`` now; a value alone there is its part ``first``."""
+
+    def table(value: Any, settings: Mapping[str, Any]) -> Any:
+        given = settings.get(key)
+        known = given if isinstance(given, dict) else {} if given is None else {first: given}
+        return None if value == usual else {**known, part: value}
+
+    return table
+
+
+def _lacks(part: str) -> Callable[[Any], bool]:
+    return lambda given: not isinstance(given, dict) or part not in given
+
+
 def _is_unrefined(given: Any) -> bool:
     return given in (0, "auto")
 
@@ -106,9 +122,17 @@ _OLD = {
     "max_strain": _Old("refine", _goal("%", 100), "null asks for nothing", _is_unrefined),
     "size_seconds": _Old("size_end", _size_end, "size_end is not given", lambda given: not isinstance(given, dict)),
     "blend_from": _Old("blend_in", _blend_in, "blend_in is 0", lambda given: not isinstance(given, list)),
+    "refine_method": _Old("refine", _part("refine", "goal", "method", "newton"), _USUAL, _lacks("method")),
+    "refine_most": _Old("refine", _part("refine", "goal", "most", 50), _USUAL, _lacks("most")),
+    "refine_table": _Old("refine", _part("refine", "goal", "table", None), _USUAL, _lacks("table")),
+    "surface_stride": _Old("metrics", _part("metrics", "kind", "surface_every", 5), _USUAL, _lacks("surface_every")),
+    "export": _Old("metrics", _part("metrics", "kind", "fields", []), _USUAL, _lacks("fields")),
+    "cloth_friction": _Old("cloth_contact", _part("cloth_contact", "mode", "friction", 0.0), _USUAL, _lacks("friction")),
+    "body_parts": _Old("objects", _part("objects", "garment", "body", []), _USUAL, _lacks("body")),
+    "accuracy": _Old("plan", lambda accuracy, _: accuracy, "null asks for no plan", lambda given: given == "auto"),
 }
 #: Those that ``hood inspect`` had as well.
-_OF_INSPECT = ("blend_from", "trans_unit", "body_scale")
+_OF_INSPECT = ("blend_from", "trans_unit", "body_scale", "body_parts")
 
 
 def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, ...]:
@@ -131,7 +155,7 @@ def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, .
             _tell(f"{given[key]} has no effect: {_OLD[key].idle}")
             continue
         before = settings.get(into)
-        if before not in (None, value) and (into in made or not _OLD[key].beside(before)):
+        if before not in (None, value) and not _OLD[key].beside(before):
             raise ValueError(f"{said[into]} and {given[key]} contradict each other; give one of them")
         settings[into], said[into], made[into] = value, given[key], _word(into, value)
         _tell(f"{given[key]} is called {made[into]} now")

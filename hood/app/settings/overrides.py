@@ -23,6 +23,7 @@ _BRACKETS = {"[": "]", "{": "}", "(": ")"}
 _NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|inf|null|true|false", re.IGNORECASE)
 #: Strings that Hydra reads as they are.
 _BARE, _WORDS = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*"), ("null", "true", "false", "nan", "inf")
+_APART = re.compile(r"(\w+)=(\w+:[^{}]+)")
 #: Keys of names: 2024_01 is a folder there, not a number.
 _NAMES = ("output", "garment", "sequence", "body", "checkpoint", "texture")
 #: What the grammar does not read in the key of a table, and how it is written there instead.
@@ -75,6 +76,13 @@ def readable(text: str, several: bool) -> str:
             raise ValueError(_without_brackets(key, value))
         return readable(f"{key}=[{value}]", several)
     return f"{key}={quoted(value)}"
+
+
+def require_braces(text: str, tables: Sequence[str]) -> None:
+    """Raise ValueError where a word is a part of a table, ``key=part:value``, as a shell makes them of braces without quotes."""
+    found = _APART.fullmatch(text)
+    if found is not None and found[1] in tables:
+        raise ValueError(f"{text}: the shell has taken the braces apart; put the word in quotes, '{found[1]}={{{found[2]},…}}'")
 
 
 def loop(command: str, key: str = "seed", values: Sequence[str] = ("0", "1")) -> str:

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.app.settings.compose import plain
+from hood.app.settings.tables import refinement, with_value
 from hood.app.stepping.cloth_contact import potential_of
 from hood.app.stepping.refinement import AUTO, refined
 from hood.app.stepping.steppers import losses_of, make_solver, option_of, with_stepper
@@ -51,7 +53,7 @@ class Choice:
         """The config with these values in the place of ``auto``."""
         settled = with_stepper(config, self.stepper)
         if self.refine is not None:
-            settled.refine = self.refine
+            settled.refine = with_value(plain(config.refine), "goal", self.refine)
         return settled
 
 
@@ -67,7 +69,7 @@ def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
     """What ``auto`` means for this scene, whose steps a network takes (``stepper``) unless the config names a solver."""
     asked = str(config.stepper)
     choice = Choice("network" if asked == AUTO else asked)
-    if config.refine == AUTO:
+    if refinement(config).goal == AUTO:
         choice.refine = _iterations(config, stepper, scene, choice)
     if asked == AUTO:
         _compare(config, stepper, scene, choice)
@@ -122,7 +124,7 @@ def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice)
     alone = _measure(solver(config), scene, potential)
     accurate = max(float(config.solver.target_rg), 0.0 if alone is None else alone.rg)
     if with_network is None or alone is None or alone.ms < with_network.ms or not with_network.rg <= accurate:
-        choice.stepper, choice.refine = "newton", 0 if config.refine == AUTO else None
+        choice.stepper, choice.refine = "newton", 0 if refinement(config).goal == AUTO else None
         choice.why = []
     if with_network is None or alone is None:
         choice.why.append(f"stepper={choice.stepper}: the motion is too short to measure which is faster")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 
 from hood.app.settings.compose import NETWORK_KEYS, plain
+from hood.app.settings.tables import Measurement, cloth_contact, measurement
 from hood.app.stepping.steppers import option_of
 from hood.energies.potential import Potential, default_potential
 from hood.energies.term import Form, Role, having, named
@@ -135,12 +136,22 @@ def _is_drawn(config: DictConfig) -> bool:
     return str(config.video) != "none" or bool(config.sheet)
 
 
+def _is_measured_as_asked(config: DictConfig) -> bool:
+    asked = measurement(config)
+    return asked.kind == "all" or asked.surface_every == Measurement().surface_every
+
+
+def _rubs_what_is_kept_apart(config: DictConfig) -> bool:
+    asked = cloth_contact(config)
+    return asked.mode != "off" or asked.friction == 0
+
+
 _ROLLOUT = (
     _Rule("fabrics_seam", lambda config: config.fabrics is not None, "fabrics are not given"),
-    _Rule("surface_stride", lambda config: str(config.metrics) == "all", "the surface is measured with metrics=all alone"),
+    _Rule("metrics", _is_measured_as_asked, "the surface is measured with kind:all alone"),
     _Rule("thin_body", _is_drawn, "nothing is drawn: video=none sheet=false"),
     _Rule("colour", lambda config: _is_drawn(config) or str(config.colour) == "rg", "nothing is drawn: video=none sheet=false"),
-    _Rule("cloth_friction", lambda config: str(config.cloth_contact) != "off", "cloth_contact=off"),
+    _Rule("cloth_contact", _rubs_what_is_kept_apart, "there is no friction with mode:off"),
 )
 _TRAIN = (
     _Rule("data.validation_sequences", lambda config: int(config.trainer.validate_every), "trainer.validate_every is 0"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -10,9 +11,11 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.app.notices import say
-from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.app.settings.compose import ConfigError, brief, plain
+from hood.app.settings.tables import cloth_contact, refinement
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
+from hood.assets.files.library import unknown
 from hood.energies.potential import Potential
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.energies.term import Role, Term, having
@@ -25,24 +28,28 @@ _CHOICES = ("auto", "on", "off", "layers")
 
 def check_cloth_contact(config: DictConfig) -> None:
     """Raise ConfigError where the key asks for what the other keys rule out."""
-    require_choice(config, "cloth_contact", _CHOICES)
-    if not float(config.cloth_friction) >= 0.0:
-        raise ConfigError(f"cloth_friction={config.cloth_friction}: give a coefficient of at least 0; 0 for none")
-    if str(config.cloth_contact) in ("on", "layers"):
+    mode, friction = cloth_contact(config)
+    if mode not in _CHOICES:
+        raise ConfigError(unknown("cloth_contact", mode, _CHOICES))
+    if not 0.0 <= friction < math.inf:
+        raise ConfigError(
+            f"cloth_contact={brief(config.cloth_contact)}: friction is {friction}; give a coefficient of at least 0; 0 for none"
+        )
+    if mode in ("on", "layers"):
         reason = _hindrance(config)
-        if reason and not (config.refine == "auto" or str(config.stepper) == "auto"):
-            raise ConfigError(f"cloth_contact={config.cloth_contact}: {reason}")
+        if reason and not (refinement(config).goal == "auto" or str(config.stepper) == "auto"):
+            raise ConfigError(f"cloth_contact={mode}: {reason}")
 
 
 def potential_of(config: DictConfig) -> Potential:
     """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
     rest of the settled config ask for them."""
     potential: Potential = losses_of(config)
-    if str(config.cloth_contact) == "off" or _why_not(config, potential):
+    asked = cloth_contact(config)
+    if asked.mode == "off" or _why_not(config, potential):
         return potential
-    potential = potential.with_terms(layers=LayerBarrier(between=str(config.cloth_contact) == "layers"))
-    coefficient = float(config.cloth_friction)
-    return potential.with_terms(layer_friction=LayerFriction(coefficient)) if coefficient > 0 else potential
+    potential = potential.with_terms(layers=LayerBarrier(between=asked.mode == "layers"))
+    return potential.with_terms(layer_friction=LayerFriction(float(asked.friction))) if asked.friction > 0 else potential
 
 
 def acts(config: DictConfig) -> bool:
@@ -51,7 +58,7 @@ def acts(config: DictConfig) -> bool:
     Raises:
         ConfigError: the key asks for it, but the settled config's steps cannot do it.
     """
-    return str(config.cloth_contact) != "off" and not why_not(config)
+    return cloth_contact(config).mode != "off" and not why_not(config)
 
 
 def why_not(config: DictConfig) -> str:
@@ -65,7 +72,7 @@ def why_not(config: DictConfig) -> str:
 
 def _why_not(config: DictConfig, potential: Potential | None = None) -> str:
     """The same, with the potential of the config's losses where it is known."""
-    asked = str(config.cloth_contact)
+    asked = cloth_contact(config).mode
     reason = "" if asked == "off" else _hindrance(config, potential)
     if reason and asked != "auto":
         raise ConfigError(f"cloth_contact={asked}: {reason}")
@@ -92,14 +99,15 @@ def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
     if _rough(config):
         taker = "a network" if option_of(config).network else f"stepper={config.stepper}"
         return f"{taker} alone does not keep layers of cloth apart; add refine=5, or use stepper=newton"
-    if str(config.refine_method) != "newton":
-        return f"refine_method={config.refine_method} moves vertices through cloth; use refine_method=newton"
+    method, mode = refinement(config).method, cloth_contact(config).mode
+    if method != "newton":
+        return f"refine={{method:{method},…}} moves vertices through cloth; use method:newton"
     if str(config.step) != "plain":
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
-    if str(config.cloth_contact) == "auto" and str(config.device) != "cpu":
+    if mode == "auto" and str(config.device) != "cpu":
         return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
     terms = (potential or losses_of(config)).terms
-    if str(config.cloth_contact) == "auto" and _are_published(terms):
+    if mode == "auto" and _are_published(terms):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"
     try:
         cloth_proximity.library()
@@ -124,7 +132,7 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
     """What ``summary.json`` says of it; nothing of files from before. ``reason`` is that of :func:`why_not`."""
     if "cloth_contact" not in config:
         return {}
-    asked = config["cloth_contact"]
+    asked, friction = cloth_contact(config)
     if "layer_contacts" not in metrics:
         return {"cloth_contact": {"asked": asked, "used": "off"} | ({"reason": reason} if reason else {})}
     known = [np.nan_to_num(np.asarray(metrics.get(name, 0.0 * metrics["layer_contacts"]))) for name in LAYER_METRICS]
@@ -134,7 +142,7 @@ def summarise_cloth_contact(config: Mapping[str, Any], metrics: Mapping[str, np.
         "cloth_contact": {
             "asked": asked,
             "used": "layers" if asked == "layers" else "on",
-            "friction": float(config.get("cloth_friction", 0.0)),
+            "friction": float(friction),
             "frames_with_contact": len(frames),
             "first_frame": int(frames[0]) if len(frames) else None,
             "last_frame": int(frames[-1]) if len(frames) else None,

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, build, require_choice
+from hood.app.settings.tables import measurement, refinement
 from hood.energies.potential import Potential
 from hood.rollouts.checks.guard import (
     CHECK,
@@ -65,10 +66,10 @@ def check_guard(config: DictConfig) -> None:
         return
     if mode == REPAIR:
         raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is repaired has not; use step=plain")
-    if mode == STRICT and str(config.metrics) != "all":
+    if mode == STRICT and measurement(config).kind != "all":
         raise ConfigError(
-            f"guard=strict: step={step} with metrics={config.metrics} measures nothing that a guard could look at; use "
-            "metrics=all"
+            f"guard=strict: step={step} with metrics={measurement(config).kind} measures nothing that a guard could look at; "
+            "use metrics=all"
         )
 
 
@@ -77,10 +78,12 @@ def make_guard(config: DictConfig, stepper: Stepper, potential: Potential) -> Gu
     mode = str(config.guard)
     if mode == OFF:
         return None
-    if str(config.step) != "plain" and str(config.metrics) != "all":
-        say(f"guard=off: step={config.step} with metrics={config.metrics} measures nothing that a guard could look at")
+    if str(config.step) != "plain" and measurement(config).kind != "all":
+        say(
+            f"guard=off: step={config.step} with metrics={measurement(config).kind} measures nothing that a guard could look at"
+        )
         return None
-    return Guard(mode, stepper, potential, build(config.solver), int(config.refine_most))
+    return Guard(mode, stepper, potential, build(config.solver), refinement(config).most)
 
 
 def write_alarms(writer: RolloutWriter, guard: Guard | None) -> None:

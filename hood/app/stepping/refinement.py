@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, brief, build, plain, require_choice
+from hood.app.settings.compose import ConfigError, brief, build, require_choice
+from hood.app.settings.tables import Refinement, measurement, refinement
 from hood.app.stepping.steppers import ALWAYS, NEVER, losses_of, option_of
+from hood.assets.files.library import unknown
 from hood.energies.potential import Potential
 from hood.rollouts.frame import FIELD_CHOICES
 from hood.solver.step_figures import count_reasons, name_counts
@@ -41,8 +43,6 @@ _BEGIN_FROM_TABLE = ("ms", "%")
 #: An iteration in units of a frame without any, where none was taken: 0.3 of garments of 1,000 to 4,000 vertices; and how
 #: much more than the median frame is given.
 _ITERATION, _ROOM = 0.4, 1.1
-#: What says more about a refinement, and its value where nothing is said.
-_DETAILS = {"refine_method": "newton", "refine_most": 50, "refine_table": None}
 
 
 class AskedRefinement(NamedTuple):
@@ -51,6 +51,7 @@ class AskedRefinement(NamedTuple):
     value: float
     unit: str
     text: str  # refine=5
+    how: Refinement
 
 
 def chosen(config: Mapping[Any, Any]) -> AskedRefinement | None:
@@ -59,11 +60,12 @@ def chosen(config: Mapping[Any, Any]) -> AskedRefinement | None:
     Raises:
         ConfigError: it is neither a number of iterations nor a goal.
     """
-    value = config.get("refine")
-    if value in (None, 0, AUTO):
+    how = refinement(config)
+    value = how.goal
+    if value in (0, AUTO):
         return None
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and float(value).is_integer():
-        return AskedRefinement(float(value), "", f"refine={value:g}")
+    if isinstance(value, (int, float)) and float(value).is_integer():
+        return AskedRefinement(float(value), "", f"refine={value:g}", how)
     found = _GOAL.fullmatch(str(value))
     if found is None:
         raise ConfigError(
@@ -74,31 +76,31 @@ def chosen(config: Mapping[Any, Any]) -> AskedRefinement | None:
     goal = float(Decimal(number) / 100 if unit == "%" else Decimal(number))
     if not 0.0 < goal < math.inf:
         raise ConfigError(f"refine={value}: give a goal above 0, such as {_SUCH_AS[unit]}")
-    return AskedRefinement(goal, unit, f"refine={value}")
+    return AskedRefinement(goal, unit, f"refine={value}", how)
 
 
 def check_refinement(config: DictConfig) -> None:
     """Raise ConfigError where what is said about refinement, export and colour does not fit together."""
-    asked = chosen(config)
-    require_choice(config, "refine_method", METHODS)
+    asked, how = chosen(config), refinement(config)
+    if how.method not in METHODS:
+        raise ConfigError(f"refine={brief(config.refine)}: " + unknown("method", how.method, METHODS))
     require_choice(config, "colour", _COLOURS)
     if config.colour == "contact" and config.body == "none":
         raise ConfigError("colour=contact shows the distance from the body, and body=none has none; choose colour=strain")
     exported(config)
-    if int(config.refine_most) < 1:
-        raise ConfigError(f"refine_most={config.refine_most}: must be at least 1")
+    if how.most < 1:
+        raise ConfigError(f"refine={brief(config.refine)}: most is {how.most}; it must be at least 1")
     if asked is None:
         if option_of(config).refinement == ALWAYS:
             raise ConfigError(f"stepper={config.stepper} takes its steps by refinement alone; give {_WAYS}")
-        for name, default in _DETAILS.items():
-            if config[name] != default:
-                raise ConfigError(f"{name}={config[name]}: nothing is refined; give {_WAYS} as well")
+        if how != Refinement(how.goal):
+            raise ConfigError(f"refine={brief(config.refine)}: nothing is refined; give a goal as well, refine={{goal:5,…}}")
         return
     if option_of(config).refinement == NEVER:
         raise ConfigError(f"{asked.text}: stepper={config.stepper} goes as far as solver.* says; use stepper=refine instead")
-    if config.refine_table is not None and asked.unit not in _BEGIN_FROM_TABLE:
+    if how.table is not None and asked.unit not in _BEGIN_FROM_TABLE:
         raise ConfigError(
-            f"refine_table={config.refine_table}: says where refine=20ms and refine=5% begin; {asked.text} needs none"
+            f"refine={brief(config.refine)}: its table says where refine=20ms and refine=5% begin; {asked.text} needs none"
         )
     make_goal(config, num_vertices=1000)
 
@@ -109,12 +111,11 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     Raises:
         ConfigError: an unknown one.
     """
-    names = [str(name) for name in plain(config.export)]
+    names = measurement(config).fields
     for name in names:
         if name not in FIELD_CHOICES:
-            raise ConfigError(
-                f"export={brief(config.export)}: unknown {brief(name)!r}; give some of [{','.join(FIELD_CHOICES)}]"
-            )
+            choices = ",".join(FIELD_CHOICES)
+            raise ConfigError(f"metrics={brief(config.metrics)}: unknown field {brief(name)!r}; give some of [{choices}]")
     drawn = str(config.colour)
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 
@@ -128,19 +129,18 @@ def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None
     asked = chosen(config)
     if asked is None:
         return None
-    most = int(config.refine_most)
+    how = asked.how
     if not asked.unit:
         return Count(int(asked.value))
     if asked.unit == "rg":
-        return TargetResidual(asked.value, most)
-    table = None if config.refine_table is None else Path(str(config.refine_table)).expanduser()
-    method = str(config.refine_method)
+        return TargetResidual(asked.value, how.most)
+    table = None if how.table is None else Path(how.table).expanduser()
     if asked.unit == "ms":
-        return Budget(asked.value, most, None if table is None else costs_from_table(table, num_vertices, method))
+        return Budget(asked.value, how.most, None if table is None else costs_from_table(table, num_vertices, how.method))
     return (
-        MaxStrain(asked.value, most)
+        MaxStrain(asked.value, how.most)
         if table is None
-        else MaxStrain(asked.value, most, floor_from_table(table, asked.value, num_vertices, method))
+        else MaxStrain(asked.value, how.most, floor_from_table(table, asked.value, num_vertices, how.method))
     )
 
 
@@ -151,7 +151,7 @@ def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: 
     if goal is None:
         return stepper
     potential = losses_of(config) if potential is None else potential
-    return RefinedStepper(stepper, potential, goal, str(config.refine_method), build(config.solver))
+    return RefinedStepper(stepper, potential, goal, refinement(config).method, build(config.solver))
 
 
 def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.nda
     iterations, residual = metrics["refine_iterations"][1:], metrics["refine_rg"][1:]
     entry: dict[str, Any] = {
         "asked": asked.text,
-        "method": str(config["refine_method"]),
+        "method": asked.how.method,
         "iterations_median": _of(np.median, iterations),
         "iterations_max": _of(np.max, iterations),
         "rg_median": _of(np.median, residual),

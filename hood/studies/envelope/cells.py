@@ -152,7 +152,12 @@ def _pins_and_layers() -> Iterator[Cell]:
         yield Cell("layers", outfit, garment=outfit)
         yield Cell("layers", f"{outfit} crouching", motion="crouch:110", garment=outfit)
     for friction in (0.5, 2.0):
-        yield Cell("layers", f"[tank,skirt], friction {friction:g}", (f"cloth_friction={friction:g}",), garment="[tank,skirt]")
+        yield Cell(
+            "layers",
+            f"[tank,skirt], friction {friction:g}",
+            (f"cloth_contact={{friction:{friction:g}}}",),
+            garment="[tank,skirt]",
+        )
     for garment, pose in (("dress", "crouch:110"), ("longsleeve", "crossed:110"), ("trousers", "crouch:130")):
         name = f"{garment} {pose.replace(':', ' ')}"
         yield Cell("compression", name, motion=pose, garment=garment)
@@ -235,9 +240,11 @@ def _together() -> Iterator[Cell]:
 
 def _long() -> Iterator[Cell]:
     """Whether anything grows slowly."""
-    yield Cell("long", "rest, 10,000 frames", ("surface_stride=100",), motion="rest", fault="remesh:300", garment="dress",
-               frames=10_000, seconds=334.0, long=True)  # fmt: skip
-    yield Cell("long", "walk, 3,000 frames", ("loop=50", "surface_stride=20"), sequence="walk_proud", frames=3_000, long=True)
+    yield Cell("long", "rest, 10,000 frames", ("metrics={surface_every:100}",), motion="rest", fault="remesh:300",
+               garment="dress", frames=10_000, seconds=334.0, long=True)  # fmt: skip
+    yield Cell(
+        "long", "walk, 3,000 frames", ("loop=50", "metrics={surface_every:20}"), sequence="walk_proud", frames=3_000, long=True
+    )
 
 
 def _inputs() -> Iterator[Cell]:
@@ -252,8 +259,8 @@ def _inputs() -> Iterator[Cell]:
     for text in (
         "fps=0", "fps=nan", "fps=inf", "num_frames=0", "gravity=nan", "gravity=inf", "file_fps=0", "betas=[nan]", "loop=0",
         "material.density=0", "material.density=nan", "material.density=inf", "material.lame_mu=nan", "material.lame_mu=-1",
-        "material.bending_stiffness=nan", "losses.terms.friction.coefficient=nan", "cloth_friction=nan", "pins=[1000000]",
-        "pins=[-1]", "pins=knee", "surface_stride=0",
+        "material.bending_stiffness=nan", "losses.terms.friction.coefficient=nan", "cloth_contact={friction:nan}",
+        "pins=[1000000]", "pins=[-1]", "pins=knee", "metrics={surface_every:0}",
     ):  # fmt: skip
         yield Cell("input", text, (text,), bad_input=text.partition("=")[0].rpartition(".")[2])
 

@@ -136,7 +136,7 @@ def command_of(task: Task, config: DictConfig, folder: Path) -> tuple[str, ...]:
         f"num_frames={finer * (cell.num_frames - 1) + 1}",
         *settings,
     )
-    often = () if any(text.startswith("surface_stride=") for text in settings) else ("surface_stride=1",)
+    often = () if any(text.startswith("metrics=") for text in settings) else ("metrics={surface_every:1}",)
     drawn = (*(often if finer == 1 else ("metrics=strain",)), "video=none", "sheet=false")
     return ("rollout", *asked, *_method(task.model), *drawn, f"output={quoted_word(str(task.folder(folder) / 'rollout'))}")
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError
+from hood.app.settings.compose import ConfigError, plain
+from hood.app.settings.python_words import overrides
+from hood.app.settings.tables import cloth_contact, with_value
 from hood.app.stepping.cloth_contact import acts
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import losses_of
@@ -119,10 +121,6 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         ),
         acts,
     ),
-    (
-        Part("cloth friction", "layers hang on each other", ("cloth_friction=0",), "layers", watched=False),
-        lambda config: acts(config) and float(config.cloth_friction) > 0.0,
-    ),
     (Part("air", "wind pushes, still air brakes", ("losses.terms.air=null",), "air"), _given("wind")),
     (
         Part(
@@ -168,9 +166,13 @@ _ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
 def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
     """The parts that a settled config of ``hood rollout`` has; with ``steppers`` other ways to take its steps as well."""
     found = [part for part, there in (*_TERMS, *_FABRIC, *_ACCURACY) if there(config)]
+    mode, friction = cloth_contact(config)
+    if friction and acts(config):  # before contact itself, whose words then count
+        words: tuple[str, ...] = (f"cloth_contact={mode}",)
+        found.insert(0, Part("cloth friction", "layers hang on each other", words, "layers", watched=False))
     iterations = _iterations(config)
     for count in sorted({iterations // 2, 1} - {0, iterations}, reverse=True) if iterations else []:
-        words = (f"refine={count}",)
+        words = tuple(overrides({"refine": with_value(plain(config.refine), "goal", count)}))
         found.append(Part(f"iterations above {count}", "refinement of every step", words, rivals="steps"))
     if str(config.stepper) == "network" and str(config.precision) == "fp32":
         found.append(Part("float32", "latents and products in full precision", ("precision=bf16",)))

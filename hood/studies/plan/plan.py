@@ -1,6 +1,6 @@
 """``hood plan``: what a scene needs of the model, what each part costs, and what would be lost without it.
 
-``plan=auto accuracy=…``: a rollout that plans first. Plans are kept by scene, settings and processor.
+``plan=5mm``: a rollout that plans first. Plans are kept by scene, settings and processor.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from omegaconf import DictConfig
 from hood import __version__
 from hood.app.common import held_folder, output_folder
 from hood.app.notices import say
-from hood.app.plan_file import FREE, content_digest, key_of, plan_path, read_plan, write_plan
-from hood.app.settings.compose import ConfigError, load_config, named_today, with_words
+from hood.app.plan_file import FREE, content_digest, key_of, plan_accuracy, read_plan, write_plan
+from hood.app.settings.compose import ConfigError, load_config, named_today, plain, with_words
 from hood.app.settings.overrides import plain_word
+from hood.app.settings.python_words import overrides as overrides_of
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.assets.files.library import locate
 from hood.native.build import cache_folder, processor
@@ -151,7 +152,7 @@ def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
     own = {str(key) for key in load_config("plan")}
     mine = [word for word in overrides if key_of(word) in own]
     words = [word for word in overrides if word not in mine]
-    if any(word.partition("=")[0] == "plan" for word in words):
+    if any(key_of(word) == "plan" for word in words):
         raise ConfigError("plan=…: a plan is made of the full model; drop plan=…")
     return load_config("plan", mine), words if is_training(words) else list(named_today(words))
 
@@ -167,7 +168,7 @@ def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
     """What ``auto`` became."""
     alone = str(ready.config.stepper) == "newton"
     keys = [key for key in ("stepper", "refine") if asked[key] != ready.config[key] and not (alone and key == "refine")]
-    return [f"{key}={ready.config[key]}" for key in keys]
+    return overrides_of({key: plain(ready.config[key]) for key in keys})
 
 
 def _record(ready: Setup, words: list[str], asked: AskedOf, found: Probed) -> dict[str, Any]:
@@ -261,24 +262,26 @@ def _finite(value: float) -> float | None:
 
 
 def planned(overrides: Sequence[str]) -> list[str]:
-    """The words of a rollout; with ``accuracy`` its plan is made, or found where it was kept, and stands in them.
+    """The words of a rollout; where ``plan`` is an accuracy its plan is made, or found where it was kept, and stands in them.
 
     A plan lies in the user's cache folder, or beside the rollout where nothing may be kept.
 
     Raises:
-        ConfigError: ``accuracy`` beside a plan that is not ``auto``, and what ``hood plan`` refuses.
+        ConfigError: an accuracy of no use, and what ``hood plan`` refuses.
     """
     overrides = named_today(overrides)
     config = load_config("rollout", overrides)
-    if config.accuracy is None:
+    accuracy = plan_accuracy(config)
+    if accuracy is None:
         return list(overrides)
-    if plan_path(config) is not None or str(config.plan) == "full":
-        raise ConfigError(f"accuracy={config.accuracy}: belongs to plan=auto, not to plan={config.plan}; drop one of the two")
-    rest = [word for word in overrides if key_of(word) not in ("accuracy", "plan")]
-    words = [word for word in rest if key_of(word) not in FREE or key_of(word) == "num_frames"]
-    own = with_words(load_config("plan"), [f"accuracy={config.accuracy}"])
+    words = [word for word in overrides if key_of(word) not in ("plan", *FREE) or key_of(word) == "num_frames"]
+    try:
+        Tolerance.read(accuracy)
+    except ValueError as error:
+        raise ConfigError(str(error).replace("accuracy=", "plan=")) from error
+    own = with_words(load_config("plan"), [f"accuracy={accuracy}"])
     cache = cache_folder()
-    path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, str(config.accuracy))}.json"
+    path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, accuracy)}.json"
     if path.is_file():
         plan = read_plan(path)
         say(f"plan of {path}, made before")
@@ -288,7 +291,7 @@ def planned(overrides: Sequence[str]) -> list[str]:
         write_plan(path, plan)
         say(f"planned in {plan['seconds']:.1f} s, kept in {path}")
     say(sentence(plan))
-    return [*rest, f"plan='{path}'"]
+    return [*(word for word in overrides if key_of(word) in FREE), f"plan='{path}'"]  # the others stand in it
 
 
 def _digest(words: Sequence[str], accuracy: str) -> str:

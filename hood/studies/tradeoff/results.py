@@ -166,7 +166,7 @@ def overstretched(reached: Iterable[Reached]) -> set[Point]:
 
 
 def refinement_tables(reached: Sequence[Reached]) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """By series, the table that ``refine_table`` of a rollout reads: what so many iterations cost and reach at each size.
+    """By series, the table that ``refine`` of a rollout reads: what so many iterations cost and reach at each size.
 
     Without iterations all methods are the same, so each of them has that row. Finite entries only.
     """

@@ -259,7 +259,7 @@ def _write(folder: Path, reached: Sequence[Reached], failures: Sequence[Failure]
 
 
 def _write_tables(folder: Path, reached: Sequence[Reached]) -> list[Path]:
-    """``points.csv`` and ``points.json``, and the tables for ``refine_table``, whose paths are returned: of every series, and
+    """``points.csv`` and ``points.json``, and the tables for ``refine``, whose paths are returned: of every series, and
     ``refine_table.json`` of the checkpoint that ``hood rollout`` takes by default, where that was measured."""
     rows = [item.row() for item in reached]
     write_rows(rows, list(rows[0]), folder, "points")

@@ -47,7 +47,7 @@ def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], rows: slice =
 
 
 def test_whole_ratios_store_simulated_frames_bit_by_bit(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("fps=120", "num_frames=23", "export=[rg]", "surface_stride=2")
+    words = ("fps=120", "num_frames=23", "metrics={fields:[rg],surface_every:2}")
     every, usual = rollout(*words, output="every")
     assert every.steps is None
     assert "output" not in usual

@@ -43,11 +43,11 @@ def rollout(*words: str, output: str = "run") -> tuple[RolloutData, dict[str, An
 
 @pytest.mark.parametrize("levels", [1, 2])
 def test_a_dress_is_stored_finer_and_measured_as_it_was_simulated(levels: int, capsys: pytest.CaptureFixture[str]) -> None:
-    coarse, usual = rollout("export=[rg]", output="coarse")
+    coarse, usual = rollout("metrics={fields:[rg]}", output="coarse")
     assert coarse.refined is None
     assert "refined_mesh" not in usual
     assert not {"refine_mesh", "simulated_vertices"} & set(coarse.attributes)
-    data, summary = rollout("export=[rg]", f"refine_mesh={levels}")
+    data, summary = rollout("metrics={fields:[rg]}", f"refine_mesh={levels}")
     count = coarse.cloth_pos.shape[1]
     assert len(data.cloth_faces) == len(coarse.cloth_faces) * 4**levels
     assert data.refined is not None

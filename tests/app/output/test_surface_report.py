@@ -62,7 +62,7 @@ def test_what_was_not_measured_is_not_claimed() -> None:
 @pytest.mark.parametrize(
     ("key", "words"),
     [
-        ("surface_stride=0", "surface_stride=0: must be at least 1"),
+        ("metrics={surface_every:0}", "surface_every is 0; it must be at least 1"),
         ("thin_body=-1", "give millimetres, 0"),
         ("thin_body=50", "to 20"),
     ],

@@ -69,8 +69,8 @@ def buttoned(tmp_path: Path) -> Path:
 
 def test_buttons_ride_in_every_frame_and_come_out_of_every_export(buttoned: Path) -> None:
     """As rigid bodies on the cloth beneath them, which moves as it does without them."""
-    plain = run(write_mesh(Path("plain.obj"), clean("tank")), "export=[rg]")[0]
-    data, _, doubts = run(buttoned, "formats=[obj,ply,glb,usd,pc2]", "export=[rg]")
+    plain = run(write_mesh(Path("plain.obj"), clean("tank")), "metrics={fields:[rg]}")[0]
+    data, _, doubts = run(buttoned, "formats=[obj,ply,glb,usd,pc2]", "metrics={fields:[rg]}")
     assert [doubt.kind for doubt in doubts] == ["garment"]
     count, riding = len(clean("tank")[0]), 4 * 26
     assert data.riding[0] == riding

@@ -75,7 +75,7 @@ def test_names_that_look_like_numbers_are_names() -> None:
         (["size=big"], ("size=big: give a number or a list in brackets, such as size=1",)),
         (["seed=abc"], ("seed=abc: give a whole number",)),
         (["kernels=false"], ("kernels=false: give text, such as kernels=auto; see hood rollout --help",)),
-        (["body_parts=1"], ("body_parts=1: give a list in brackets, the default is body_parts=[]",)),
+        (["events=1"], ("events=1: give a list in brackets, the default is events=[]",)),
         (["material.density=heavy"], ("material.density=heavy: give a number, such as material.density=0.20022",)),
         (["losses.terms.collision=null"], ("losses.terms.collision=null: losses.terms.friction takes values", "friction=null")),
         (["--video=mp4"], ("'--video=mp4': keys have no dashes; write video=mp4",)),

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
 import yaml
+from omegaconf import DictConfig
 
 import hood
 from hood.app.notices import collected
@@ -18,6 +21,7 @@ from hood.app.settings import old_keys
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, plain
 from hood.app.settings.old_keys import put_todays_keys
 from hood.app.settings.record import read_record
+from hood.app.settings.tables import measurement, objects, refinement
 from hood.app.setup import check_config
 from hood.cli.main import main
 
@@ -65,18 +69,60 @@ def unsaid() -> None:
         ("budget_ms=20 refine=auto", "refine=20ms", "budget_ms=20 is called refine=20ms now"),
         ("refine=0 budget_ms=20.0", "refine=20ms", "budget_ms=20.0 is called refine=20ms now"),
         ("max_strain=0.05", "refine=5%", "max_strain=0.05 is called refine=5% now"),
-        ("max_strain=0.005 refine_most=9", "refine=0.5% refine_most=9", "max_strain=0.005 is called refine=0.5% now"),
+        (
+            "max_strain=0.005 refine_most=9",
+            "refine={goal:0.5%,most:9}",
+            ["max_strain=0.005 is called refine=0.5% now", "refine_most=9 is called refine={goal:'0.5%',most:9} now"],
+        ),
         ("target_rg=null", "", "target_rg=null has no effect: null asks for nothing"),
         ("blend_in=1.5 blend_from=a", "blend_in=[1.5,a]", "blend_from=a is called blend_in=[1.5,a] now"),
         ("blend_from=t blend_in=2", "blend_in=2", "blend_from=t is called blend_in=2 now"),
         ("blend_from=a", "", "blend_from=a has no effect: blend_in is 0"),
+        (
+            "refine=5 refine_method=sweeps",
+            "refine={goal:5,method:sweeps}",
+            "refine_method=sweeps is called refine={goal:5,method:sweeps} now",
+        ),
+        ("refine=5 refine_method=newton", "refine=5", "refine_method=newton has no effect: it is what is usual"),
+        (
+            "refine=20ms refine_most=9 refine_table=my_table.json",
+            "refine={goal:20ms,most:9,table:my_table.json}",
+            [
+                "refine_most=9 is called refine={goal:'20ms',most:9} now",
+                "refine_table=my_table.json is called refine={goal:'20ms',most:9,table:my_table.json} now",
+            ],
+        ),
+        ("surface_stride=1", "metrics={surface_every:1}", "surface_stride=1 is called metrics={surface_every:1} now"),
+        ("surface_stride=5", "", "surface_stride=5 has no effect: it is what is usual"),
+        (
+            "metrics=strain export=[rg] surface_stride=2",
+            "metrics={kind:strain,surface_every:2,fields:[rg]}",
+            [
+                "surface_stride=2 is called metrics={kind:strain,surface_every:2} now",
+                "export=[rg] is called metrics={kind:strain,surface_every:2,fields:[rg]} now",
+            ],
+        ),
+        ("cloth_friction=0.5", "cloth_contact={friction:0.5}", "cloth_friction=0.5 is called cloth_contact={friction:0.5} now"),
+        (
+            "cloth_contact=on cloth_friction=0.5",
+            "cloth_contact={mode:on,friction:0.5}",
+            "cloth_friction=0.5 is called cloth_contact={mode:on,friction:0.5} now",
+        ),
+        ("body_parts=[Body]", "objects={body:[Body]}", "body_parts=[Body] is called objects={body:[Body]} now"),
+        (
+            "objects=[tank] body_parts=[Body]",
+            "objects={garment:[tank],body:[Body]}",
+            "body_parts=[Body] is called objects={garment:[tank],body:[Body]} now",
+        ),
+        ("accuracy=5mm", "plan=5mm", "accuracy=5mm is called plan=5mm now"),
+        ("plan=auto accuracy=0.01", "plan=0.01", "accuracy=0.01 is called plan=0.01 now"),
     ],
 )
-def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, said: str) -> None:
+def test_words_of_then_are_those_of_today_and_told_once(then: str, today: str, said: str | list[str]) -> None:
     with collected() as told:
-        configs = [load_config("rollout", then.split()) for _ in range(2)]
-    assert told == [said]
-    assert configs == 2 * [load_config("rollout", today.split())]
+        configs = [load_config("rollout", shlex.split(then)) for _ in range(2)]
+    assert told == ([said] if isinstance(said, str) else said)
+    assert [_said_by(config) for config in configs] == 2 * [_said_by(load_config("rollout", shlex.split(today)))]
 
 
 def test_what_nothing_says_today_is_the_stricter() -> None:
@@ -108,6 +154,11 @@ def test_what_nothing_says_today_is_the_stricter() -> None:
         "fail_on=unsound doubts=refuse",
         "fail_on=doubts doubts=report",
         "size_end={size:1.1,seconds:2} size_seconds=3",
+        "refine={goal:5,method:newton} refine_method=sweeps",
+        "metrics={surface_every:2} surface_stride=3",
+        "cloth_contact={friction:0.1} cloth_friction=0.5",
+        "plan=full accuracy=0.01",
+        "plan=plan.json accuracy=0.01",
     ],
 )
 def test_words_that_contradict_each_other_are_refused(words: str) -> None:
@@ -115,6 +166,11 @@ def test_words_that_contradict_each_other_are_refused(words: str) -> None:
         ConfigError, match=f"^{re.escape(words.replace(' ', ' and '))} contradict each other; give one of them$"
     ):
         load_config("rollout", words.split())
+
+
+def _said_by(config: DictConfig) -> dict[str, Any]:
+    """The keys; tables with names for what they hold."""
+    return {**plain(config), "refine": refinement(config), "metrics": measurement(config), "objects": objects(config)}
 
 
 #: Earlier keys and their defaults: every record of then has all of them.
@@ -132,6 +188,14 @@ THEN = {
     "target_rg": None,
     "budget_ms": None,
     "max_strain": None,
+    "refine_method": "newton",
+    "refine_most": 50,
+    "refine_table": None,
+    "surface_stride": 5,
+    "export": [],
+    "cloth_friction": 0.0,
+    "body_parts": [],
+    "accuracy": None,
 }
 
 
@@ -160,6 +224,14 @@ THEN = {
         ({"refine": 0, "budget_ms": 20.0}, {"refine": "20ms"}),
         ({"refine": 0, "max_strain": 0.05}, {"refine": "5%"}),
         ({"refine": 5}, {"refine": 5}),
+        (
+            {"refine": 0, "budget_ms": 20.0, "refine_most": 9, "refine_table": "t.json"},
+            {"refine": {"goal": "20ms", "most": 9, "table": "t.json"}},
+        ),
+        ({"refine": 4, "refine_method": "sweeps"}, {"refine": {"goal": 4, "method": "sweeps"}}),
+        ({"surface_stride": 1, "export": ["rg"]}, {"metrics": {"kind": "all", "surface_every": 1, "fields": ["rg"]}}),
+        ({"cloth_contact": "layers", "cloth_friction": 0.3}, {"cloth_contact": {"mode": "layers", "friction": 0.3}}),
+        ({"objects": ["tank"], "body_parts": ["Skin"]}, {"objects": {"garment": ["tank"], "body": ["Skin"]}}),
         ({"blend_in": 1.0}, {"blend_in": 1.0}),
         ({"blend_from": "a"}, {}),
         ({"events": [{"frame": 3, "close": "zip"}]}, {"events": [{"frame": 3, "close": "zip"}]}),
@@ -245,4 +317,4 @@ def test_keys_of_then_are_no_keys_of_today() -> None:
 def test_a_rollout_has_few_keys() -> None:
     """A new one is first looked for as a value of another."""
     keys = yaml.safe_load((CONFIG_FOLDER / "rollout.yaml").read_text(encoding="utf-8"))
-    assert len(keys.keys() - {"defaults"}) <= 68
+    assert len(keys.keys() - {"defaults"}) <= 60

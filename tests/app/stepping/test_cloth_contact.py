@@ -52,7 +52,7 @@ def test_cloth_that_meets_none_moves_to_the_bit_as_without(capsys: pytest.Captur
 @pytest.mark.usefixtures("compiled_layers")
 def test_a_sleeve_that_meets_itself_is_kept_apart() -> None:
     """From when the elbows are bent."""
-    found, _ = _run("garment=longsleeve", "sequence=dance_mixed", "start=0.8", "surface_stride=1")
+    found, _ = _run("garment=longsleeve", "sequence=dance_mixed", "start=0.8", "metrics={surface_every:1}")
     assert found["cloth_contact"]["frames_with_contact"] > 0
     assert found["cloth_contact"]["frames_with_crossed_cloth"] == []
     assert found["surface"]["self_crossings"]["worst"] == 0
@@ -62,10 +62,10 @@ def test_a_sleeve_that_meets_itself_is_kept_apart() -> None:
     ("more", "sentence"),
     [
         (["stepper=network", "refine=0", "cloth_contact=on"], "a network alone does not keep layers of cloth apart"),
-        (["stepper=refine", "refine=2", "refine_method=sweeps", "cloth_contact=on"], "use refine_method=newton"),
+        (["stepper=refine", "refine={goal:2,method:sweeps}", "cloth_contact=on"], "use method:newton"),
         (["step=fixed", "cloth_contact=layers"], "use step=plain"),
         (["cloth_contact=maybe"], "cloth_contact"),
-        (["cloth_friction=-0.1"], "give a coefficient of at least 0"),
+        (["cloth_contact={friction:-0.1}"], "give a coefficient of at least 0"),
     ],
 )
 def test_what_cannot_be_had_is_refused(more: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,7 +77,7 @@ def test_what_cannot_be_had_is_refused(more: list[str], sentence: str, capsys: p
     ("more", "reason", "said"),
     [
         (["step=fixed"], "step=fixed has fixed shapes", "cloth_contact=auto: off; step=fixed has fixed shapes"),
-        (["stepper=refine", "refine=1", "refine_method=sweeps"], "use refine_method=newton", "refine_method=sweeps moves"),
+        (["stepper=refine", "refine={goal:1,method:sweeps}"], "use method:newton", "method:sweeps,…} moves"),
         (["losses=reference"], "cloth_contact=on adds it", "are those of published code"),
         (["stepper=network", "refine=0", "checkpoint=untrained", "model=small"], "add refine=5", ""),
     ],
@@ -142,7 +142,7 @@ def test_sentences_name_crossed_starts_and_forced_and_late_pins() -> None:
     columns["layer_crossed"][3] = 12
     columns["layer_forced"][4] = 2
     found = summarise_cloth_contact({"cloth_contact": "auto"}, columns)
-    rough = summarise_cloth_contact({"cloth_contact": "auto", "cloth_friction": 0.5}, columns)
+    rough = summarise_cloth_contact({"cloth_contact": {"friction": 0.5}}, columns)
     assert (found["cloth_contact"]["friction"], rough["cloth_contact"]["friction"]) == (0.0, 0.5)
     text = "\n".join(describe_cloth_contact(found))
     assert "3 frames (2 to 4), up to 7 pairs" in text

@@ -25,17 +25,23 @@ IDLE = [
         "model=small model.latent_dim=8 has no effect: with stepper=guess",
     ),
     (["fabrics_seam=0.1"], "fabrics_seam=0.1 has no effect: fabrics are not given"),
-    (["metrics=strain", "surface_stride=2"], "surface_stride=2 has no effect: the surface is measured with metrics=all alone"),
+    (
+        ["metrics={kind:strain,surface_every:2}"],
+        "metrics={kind:strain,surface_every:2} has no effect: the surface is measured with kind:all alone",
+    ),
     (["video=none", "sheet=false", "thin_body=8"], "thin_body=8 has no effect: nothing is drawn"),
     (["video=none", "sheet=false", "colour=strain"], "colour=strain has no effect: nothing is drawn"),
-    (["cloth_contact=off", "cloth_friction=0.5"], "cloth_friction=0.5 has no effect: cloth_contact=off"),
+    (
+        ["cloth_contact={mode:off,friction:0.5}"],
+        "cloth_contact={mode:off,friction:0.5} has no effect: there is no friction with mode:off",
+    ),
 ]
 BUSY = [
     ["checkpoint=ours", "precision=bf16"],
     ["stepper=network", "kernels=torch"],
     ["video=none", "thin_body=8"],
     ["video=none", "sheet=false", "colour=rg"],  # it is stored as well
-    ["cloth_friction=0.5"],
+    ["cloth_contact={friction:0.5}"],
 ]
 
 

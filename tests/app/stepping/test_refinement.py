@@ -20,19 +20,19 @@ REFUSED = {
     "another unit": (["refine=5kg"], "refine=5kg: give a whole number of iterations, or auto, or a goal such as 0.1rg"),
     "a key on the solver": (["stepper=newton", "refine=3"], "stepper=newton goes as far as solver.* says"),
     "refinement of nothing by nothing": (["stepper=refine"], "stepper=refine takes its steps by refinement alone"),
-    "details without a key": (["refine_method=sweeps"], "refine_method=sweeps: nothing is refined"),
+    "details without a key": (["refine={method:sweeps}"], "nothing is refined"),
     "a table for another key": (
-        ["refine=2", "refine_table=t.json"],
+        ["refine={goal:2,table:t.json}"],
         "says where refine=20ms and refine=5% begin; refine=2 needs none",
     ),
-    "no such table": (["refine=10%", "refine_table=t.json"], "t.json: no such file"),
-    "no such table of times": (["refine=50ms", "refine_table=t.json"], "t.json: no such file"),
-    "misspelt method": (["refine=2", "refine_method=sweep"], "'sweeps'"),
+    "no such table": (["refine={goal:10%,table:t.json}"], "t.json: no such file"),
+    "no such table of times": (["refine={goal:50ms,table:t.json}"], "t.json: no such file"),
+    "misspelt method": (["refine={goal:2,method:sweep}"], "'sweeps'"),
     "zero budget": (["refine=0ms"], "refine=0ms: give a goal above 0, such as 20ms"),
     "negative count": (["refine=-1"], "refine is -1; give 0 or more iterations"),
     "a word": (["refine=lowrg"], "refine=lowrg: give a whole number of iterations"),
-    "no iterations": (["refine=0.1rg", "refine_most=0"], "refine_most=0: must be at least 1"),
-    "unknown export": (["export=[gamma]"], "unknown 'gamma'; give some of"),
+    "no iterations": (["refine={goal:0.1rg,most:0}"], "most is 0; it must be at least 1"),
+    "unknown export": (["metrics={fields:[gamma]}"], "unknown field 'gamma'; give some of"),
     "unknown colour": (["colour=heat"], "unknown value for colour 'heat'"),
 }
 
@@ -53,7 +53,7 @@ def test_what_does_not_fit_together_is_refused(case: str, capsys: pytest.Capture
 
 
 def test_a_target_is_reported_frame_by_frame(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*SHORT, "refine=0.5rg", "refine_most=4", "colour=rg", "sheet=true", "num_frames=3"]) == 0
+    assert main([*SHORT, "refine={goal:0.5rg,most:4}", "colour=rg", "sheet=true", "num_frames=3"]) == 0
     assert Path("run/contact_sheet.png").stat().st_size > 0
     data = read_rollout(Path("run/rollout.h5"))
     met, reached = data.metrics["refine_met"], data.metrics["refine_rg"]
@@ -109,7 +109,7 @@ def test_a_goal_is_a_value_with_its_unit(value: object, goal: float, unit: str) 
 
 def test_a_budget_counts_whole_frames() -> None:
     """Frame 0 has no step; what is not finite is not counted."""
-    config = {"refine": "100ms", "refine_method": "newton"}
+    config = {"refine": "100ms"}
     times = np.array([np.nan, 90.0, 100.0, 110.0, np.nan])
     metrics = {"ms_total": times, "refine_iterations": np.array([np.nan, 3, 2, 4, np.nan]), "refine_rg": times / 100}
     entry = summarise_refinement(config, metrics)["refinement"]
@@ -129,7 +129,7 @@ def test_a_budget_counts_whole_frames() -> None:
     ],
 )
 def test_a_budget_that_is_used_up_before_an_iteration_is_told(iterations: list, refining: list, told: str | None) -> None:
-    config = {"refine": "3ms", "refine_method": "newton"}
+    config = {"refine": "3ms"}
     metrics = {
         "refine_iterations": np.array([np.nan, *iterations]), "refine_rg": np.full(4, np.nan),
         "ms_total": np.array([np.nan, 10.0, 10.0, 10.0]), "ms_refine": np.array([np.nan, *refining]),

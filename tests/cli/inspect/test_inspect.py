@@ -104,7 +104,7 @@ def test_kinds(tmp_path: Path) -> None:
 def test_errors_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for words, expected in (
         ([], "no file is given"),
-        (["tank", "body_part=[a]"], "unknown key 'body_part': did you mean 'body_parts'"),
+        (["tank", "object=[a]"], "unknown key 'object': did you mean 'objects'"),
         (["tank", "scale=0.01"], "unknown key 'scale'"),
         (["tank", "--fast"], "unknown option '--fast'"),
     ):

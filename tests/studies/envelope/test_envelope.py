@@ -67,7 +67,7 @@ def test_cells_bring_their_own_garment_body_and_motion(tmp_path: Path) -> None:
     assert "garment=[tank,skirt]" in words("layers-tank-skirt")
     assert {"sequence=none", f"body={tmp_path}/inputs/body.obj"} <= set(words("drop-2-m"))
     assert {"garment=skirt", "pins=[waistband,hem]"} <= set(words("pins-hem-legs-90-degrees-apart"))
-    assert {"loop=50", "sequence=walk_proud", "surface_stride=20"} <= set(
+    assert {"loop=50", "sequence=walk_proud", "metrics={surface_every:20}"} <= set(
         command_of(Task(next(c for c in cells() if c.long and c.sequence), "tank", "newton"), config, tmp_path)
     )
     folders = {task.folder(tmp_path) for task in tasks}

@@ -1,4 +1,4 @@
-"""``plan=auto|full`` and ``accuracy=``: the same frames without shortcuts, and a plan that is made once."""
+"""``plan=auto|full|ACCURACY``: the same frames without shortcuts, and a plan that is made once."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_with_an_accuracy_a_rollout_plans_once(
     short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ["rollout", *WORDS, *QUIET, "accuracy=0.01", f"output={tmp_path / 'out'}"]
+    command = ["rollout", *WORDS, *QUIET, "plan=0.01", f"output={tmp_path / 'out'}"]
     assert main(command) == 0
     assert "planned in" in capsys.readouterr().out
     (kept,) = (short / "plans").iterdir()
@@ -55,10 +55,10 @@ def test_with_an_accuracy_a_rollout_plans_once(
     assert rollout_config([f"plan={beside}"]).solver.target_rg == 0.1
 
     monkeypatch.setattr(plan_auto, "make_plan", lambda words, own, evidence: pytest.fail("planned again"))
-    assert main([*command, "surface_stride=7"]) == 0
+    assert main([*command, "metrics={surface_every:7}"]) == 0
     assert "made before" in capsys.readouterr().out
     monkeypatch.setattr(plan_auto, "make_plan", lambda words, own, evidence: (_ for _ in ()).throw(ValueError("plans again")))
-    for other in ("accuracy=0.02", "material=denim", "num_frames=7"):
+    for other in ("plan=0.02", "material=denim", "num_frames=7"):
         assert main([*command, other]) == 2
         assert "plans again" in capsys.readouterr().err
 
@@ -76,9 +76,9 @@ def test_a_plan_is_of_the_files_it_was_made_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["plan=full", "accuracy=0.01"], "belongs to plan=auto"),
-        (["accuracy=5cm"], "accuracy=5cm"),
-        (["accuracy=0.01", "garment=tnk"], "tank"),
+        (["plan=full", "accuracy=0.01"], "plan=full and accuracy=0.01 contradict each other"),
+        (["plan=5cm"], "plan=5cm"),
+        (["plan=0.01", "garment=tnk"], "tank"),
         (["plan=ful"], "no such file"),
     ],
 )
@@ -92,13 +92,20 @@ def test_what_does_not_fit_is_told_in_a_line(
 
 
 def test_too_few_frames_to_plan_are_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["rollout", *WORDS[:3], *QUIET, "num_frames=3", "accuracy=0.01", f"output={tmp_path / 'out'}"]) == 2
+    assert main(["rollout", *WORDS[:3], *QUIET, "num_frames=3", "plan=0.01", f"output={tmp_path / 'out'}"]) == 2
     said = capsys.readouterr().err
     assert "a plan: 3 frames are too few for a window of 7; give more frames (num_frames" in said
     assert "no accuracy=" in said
     assert not (tmp_path / "out").exists()
 
 
+def test_python_plans_first_as_well(short: Path) -> None:
+    simulation = hood.simulate("tank", "plie", num_frames=12, plan=0.01)
+    assert "planned in" in simulation.notes[0]
+    assert len(list(simulation)) == 12
+    assert hood.simulate("tank", "plie", num_frames=12, accuracy=0.01).notes[1].endswith("made before")
+
+
 def test_a_plan_is_not_of_objects() -> None:
-    with pytest.raises(ValueError, match="accuracy=0.01: a plan names garment"):
-        hood.simulate(hood.load_garment("tank"), accuracy=0.01)
+    with pytest.raises(ValueError, match="plan=0.01: a plan names garment"):
+        hood.simulate(hood.load_garment("tank"), plan=0.01)

@@ -38,8 +38,8 @@ STEPPERS: dict[str, tuple[str, ...]] = {
     "guess": ("stepper=guess",),
     "guess+1": ("stepper=refine", "refine=1"),
     "guess+5": ("stepper=refine", "refine=5"),
-    "sweeps+5": ("stepper=refine", "refine=5", "refine_method=sweeps"),
-    "sweeps+40": ("stepper=refine", "refine=40", "refine_method=sweeps"),
+    "sweeps+5": ("stepper=refine", "refine={goal:5,method:sweeps}"),
+    "sweeps+40": ("stepper=refine", "refine={goal:40,method:sweeps}"),
 }
 
 
