@@ -146,8 +146,7 @@ def _with_keys(known: DictConfig, keys: Sequence[Override]) -> DictConfig | None
         for override in keys:
             if override.type is not OverrideType.CHANGE or override.is_sweep_override() or override.package is not None:
                 return None
-            key = override.key_or_group
-            OmegaConf.update(config, key, override.value(), merge=key not in TABLES)
+            OmegaConf.update(config, override.key_or_group, override.value(), merge=override.key_or_group not in TABLES)
     except OmegaConfBaseException:
         return None
     return config

@@ -79,7 +79,7 @@ def readable(text: str, several: bool) -> str:
 
 
 def require_braces(text: str, tables: Sequence[str]) -> None:
-    """Raise ValueError where a word is a part of a table, ``key=part:value``, as a shell makes them of braces without quotes."""
+    """Raise ValueError where a word is a part of a table, ``key=part:value``: a shell makes them of braces without quotes."""
     found = _APART.fullmatch(text)
     if found is not None and found[1] in tables:
         raise ValueError(f"{text}: the shell has taken the braces apart; put the word in quotes, '{found[1]}={{{found[2]},…}}'")
