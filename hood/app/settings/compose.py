@@ -17,8 +17,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hood.app.settings.old_keys import todays_words
-from hood.app.settings.old_targets import rename_targets
+from hood.app.settings.old_names import rename_targets, todays_words
 from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable, require_braces
 from hood.assets.files.library import unknown
 from hood.plugins import config_folders, packages, without_options
@@ -82,7 +81,7 @@ def load_config(name: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def named_today(words: Sequence[str], command: str = "rollout") -> tuple[str, ...]:
-    """The words of a command by today's keys, see :func:`hood.app.settings.old_keys.todays_words`.
+    """The words of a command by today's keys, see :func:`hood.app.settings.old_names.todays_words`.
 
     Raises:
         ConfigError: a word contradicts another.

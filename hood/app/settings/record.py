@@ -12,8 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.settings.compose import _REASON, ConfigError, _one_line
-from hood.app.settings.old_keys import put_todays_keys
-from hood.app.settings.old_targets import rename_targets
+from hood.app.settings.old_names import put_todays_keys, rename_targets
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 

@@ -1,7 +1,8 @@
-"""Earlier keys of ``hood rollout``: words and records that have them mean what they meant."""
+"""Earlier keys of ``hood rollout`` mean what they meant, and classes are found where they are today."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shlex
@@ -11,25 +12,26 @@ from typing import Any
 import h5py
 import pytest
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import hood
 from hood.app.notices import collected
 from hood.app.output.summary import summarise
 from hood.app.plan_file import rollout_config, write_plan
-from hood.app.settings import old_keys
-from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, plain
-from hood.app.settings.old_keys import put_todays_keys
+from hood.app.settings import old_names
+from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, plain
+from hood.app.settings.old_names import put_todays_keys
 from hood.app.settings.record import read_record
 from hood.app.settings.tables import measurement, objects, refinement
 from hood.app.setup import check_config
 from hood.cli.main import main
+from hood.energies.contact import Collision
 
 
 @pytest.fixture(autouse=True)
 def unsaid() -> None:
     """Every sentence is said again."""
-    old_keys._tell.cache_clear()
+    old_names._tell.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -311,10 +313,43 @@ def test_a_rollout_of_then_is_resumed_and_summarised(tmp_path: Path, monkeypatch
 def test_keys_of_then_are_no_keys_of_today() -> None:
     keys = yaml.safe_load((CONFIG_FOLDER / "rollout.yaml").read_text(encoding="utf-8"))
     assert not THEN.keys() & keys.keys()
-    assert THEN.keys() == old_keys._OLD.keys()
+    assert THEN.keys() == old_names._OLD.keys()
 
 
 def test_a_rollout_has_few_keys() -> None:
     """A new one is first looked for as a value of another."""
     keys = yaml.safe_load((CONFIG_FOLDER / "rollout.yaml").read_text(encoding="utf-8"))
     assert len(keys.keys() - {"defaults"}) <= 60
+
+
+def test_every_module_of_today_is_there() -> None:
+    for module in old_names._MOVED.values():
+        importlib.import_module(module)
+
+
+def test_a_term_of_an_old_config_is_built() -> None:
+    given = {"_target_": "hood.losses.potential.Potential", "terms": {"a": {"_target_": "hood.losses.collision.Collision"}}}
+    potential = build(given)
+    assert type(potential.terms["a"]) is Collision
+    assert given["_target_"].startswith("hood.losses.")  # what was given stays as it is
+
+
+@pytest.mark.parametrize("make", [dict, OmegaConf.create])
+def test_lists_and_other_values_stay(make) -> None:
+    node = make(
+        {"list": [{"_target_": "hood.dynamics.stepper.NewtonStepper"}, 1], "none": None, "_target_": "torch.optim.Adam"}
+    )
+    old_names.rename_targets(node)
+    assert node["list"][0]["_target_"] == "hood.steppers.newton.NewtonStepper"
+    assert (node["list"][1], node["none"], node["_target_"]) == (1, None, "torch.optim.Adam")
+
+
+def test_the_record_of_an_old_run_has_the_classes_of_today(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("losses:\n  terms:\n    inertia: {_target_: hood.losses.inertia.Inertia}\n")
+    found = read_record(tmp_path / "config.yaml")["losses"]["terms"]["inertia"]["_target_"]
+    assert found == "hood.energies.mass_points.Inertia"
+
+
+def test_a_name_that_never_was_is_refused() -> None:
+    with pytest.raises(ConfigError):
+        build({"_target_": "hood.losses.collision.NoSuchClass"})
