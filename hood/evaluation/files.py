@@ -21,11 +21,11 @@ from hood.evaluation.table import ALL, FAILURE_STRAIN, INTERVALS, TERMS, Measure
 
 _NAMES = ("model", "weights", "garment")
 _MAIN = ("steps", "radius", "ms", "ms_p99", "fps", "L_total", "gradient_norm", "rg")
-_GAP = ("gap", "gap_p95", "unconverged", "disagree")
+_GAP = ("gap", "gap_p95", "L_above", "unconverged", "disagree")
 _TERMS = ("L_guess", *(f"L_{name}" for name in TERMS))
 _STATE = ("distance", "strain_p99", "penetration", "penetration_worst", "drift")
 _SURFACE = ("cut_faces", "cut_faces_worst", "crossings")
-_FAILURE = ("sound", "unsound_for", "failed_at", "failed", "frames_to_failure")
+_FAILURE = ("sound", "worn", "unsound_for", "failed_at", "failed", "frames_to_failure")
 _ENDS = tuple(f"{column}_{end}" for column in INTERVALS for end in ("low", "high"))
 #: Characters of a line at most.
 _WIDTH = 160
@@ -33,7 +33,7 @@ _WIDTH = 160
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """The columns of the rows' files: the same ones for all rows, and one for every other energy that acts in some of them."""
-    counts = ("rollouts", "frames", "gap_states", "gap_spread")
+    counts = ("rollouts", "frames", "gap_states", "gap_spread", "L_states")
     return (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_others(rows), *_STATE, *_SURFACE, *_FAILURE, *counts, *_ENDS)
 
 
@@ -44,7 +44,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     energies = [_fixed_width(rows, (*_NAMES, *_TERMS, *others))]
     if energies[0].index("\n") > _WIDTH:
         energies = [_fixed_width(rows, (*_NAMES, *some)) for some in (_TERMS, others)]
-    first, last = (*_NAMES, *_MAIN, *_GAP, "sound", "failed"), (*_NAMES, *_STATE, *_SURFACE)
+    first, last = (*_NAMES, *_MAIN, *_GAP, "sound"), (*_NAMES, "worn", "failed", *_STATE, *_SURFACE)
     return "\n\n".join((_fixed_width(rows, first), *energies, _fixed_width(rows, last)))
 
 
@@ -55,9 +55,11 @@ def describe_rows(rows: Sequence[Mapping[str, Any]]) -> str:
         "deeper than 2 mm, cut_faces, the share of the cloth's triangles that the body cuts, crossings, the pairs of triangles "
         "that pass through each other; medians over frames: rg = ‖∇Φ‖ / ‖M g‖ and strain_p99; drift [m] is to the side",
         "gap = (Φ - Φ*) / e0, the energy above the minimum of the same step: median and 95th percentile; √gap is about the "
-        "error of the accelerations in g",
+        "error of the accelerations in g; L_above [J] is the same energy, median. L_total is a mean over frames and contains "
+        "gravity: cloth that slides off the body has a lower one, so read it beside worn and gap",
         "sound: share of the rollouts that the verdict calls so (docs/verdict.md; unsound_for in the files says why not); "
-        "distance [m] to the minimum of a step, 99th percentile over the vertices, median over frames",
+        "worn: share of the frames before a part of the garment has come off the body; distance [m] to the minimum of a step, "
+        "99th percentile over the vertices, median over frames",
         f"failed: share of the rollouts with a frame that is not finite or whose strain_p99 exceeds {FAILURE_STRAIN:.0%}; "
         "frames_to_failure (in the files) is the median of those frames. 95% intervals over rollouts are in the files",
     ]

@@ -32,7 +32,7 @@ from hood.model.network.model import MeshGraphNet
 from hood.rollouts.frame import Frame
 from hood.rollouts.frames import KeptFrames
 from hood.rollouts.loop import simulate
-from hood.rollouts.verdict.rule import judge_rollout
+from hood.rollouts.verdict.rule import Verdict, judge_rollout
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.network import NetworkStepper
@@ -182,13 +182,15 @@ class MeasuredRollout:
 
     frames: list[dict[str, float]] = field(default_factory=list)  # metrics of the finite frames that count
     failures: list[int] = field(default_factory=list)  # first non-finite frames
-    gaps: list[dict[str, float]] = field(default_factory=list)  # γ, converged (0 or 1), spread [e0] of every state looked at
+    #: Of every state looked at: γ, converged (0 or 1), spread [e0], L and what it is above the minimum [J].
+    gaps: list[dict[str, float]] = field(default_factory=list)
     drifts: list[float] = field(default_factory=list)  # [m] to the side, on a body that stands still
     ends: list[int | None] = field(default_factory=list)  # of every rollout: first frame failed, see FAILURE_STRAIN; None: none
 
     #: Of every rollout why it is unsound, by the rule; []: sound; None: not known.
     kinds: list[list[str] | None] = field(default_factory=list)
     spectra: list[dict[str, Any]] = field(default_factory=list)  # of the states of gaps, see error_spectrum
+    worn: list[float] = field(default_factory=list)  # of every rollout the share of its frames before the cloth came off
 
     def __add__(self, other: MeasuredRollout) -> MeasuredRollout:
         return MeasuredRollout(*(getattr(self, item.name) + getattr(other, item.name) for item in fields(self)))
@@ -206,20 +208,22 @@ def evaluate(
 
     Means over the frames that a candidate's own rollouts reach before the first non-finite one; ``failed_at`` is the earliest
     such frame (None: never). ``sound`` is the share of rollouts that :mod:`hood.rollouts.verdict` calls so, ``unsound_for``
-    what the others were called unsound for, and how many; ``distance`` [m] the median over frames of the 99th percentile of the
-    distance to the minimum of a step. Of the ``rollouts``, ``failed`` is the share that failed, as non-finite or by
-    :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that lasted counted as
-    later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network. ``L_NAME`` is the energy
-    of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum, ``L_guess`` the potential of
-    the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged over frames;
-    ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than 2 mm,
-    ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the body cuts,
-    ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth triangles that pass through
-    each other, all three of the frames where they are measured; ``drift`` [m] is the largest of those measured (None: none
-    was). Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th percentile,
-    ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations ended in
-    different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart. Columns of :data:`INTERVALS` have 95%
-    intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
+    what the others were called unsound for, and how many, ``worn`` the share of the frames before a part of the garment has
+    come off the body (:mod:`hood.rollouts.verdict.worn`) or one that is not finite; ``distance`` [m] the median over frames of
+    the 99th percentile of the distance to the minimum of a step. Of the ``rollouts``, ``failed`` is the share that failed, as
+    non-finite or by :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that
+    lasted counted as later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network.
+    ``L_NAME`` is the energy of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum,
+    ``L_guess`` the potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of
+    ‖∂L/∂x_v‖₂, averaged over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of
+    vertices deeper than 2 mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's
+    triangles that the body cuts, ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth
+    triangles that pass through each other, all three of the frames where they are measured; ``drift`` [m] is the largest of
+    those measured (None: none was). Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the median,
+    ``gap_p95`` the 95th percentile, ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share
+    where minimisations ended in different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart;
+    ``L_states`` is L_total of these states alone and ``L_above`` what it is above their minima [J], both medians. Columns of
+    :data:`INTERVALS` have 95% intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
     """
     rows, done = [], 0
     for candidate in candidates:
@@ -255,7 +259,14 @@ def measure(
         tell(f"{candidate.name} {scene.garment.name} {scene.motion.name} {text}")
     verdict = judge_rollout(kept.data())
     measured.kinds.append(None if verdict.sound is None else [reason.kind for reason in verdict.reasons])
+    measured.worn.append(_worn_share(verdict, min(num_frames, scene.num_frames)))
     return measured
+
+
+def _worn_share(verdict: Verdict, count: int) -> float:
+    """The share of ``count`` frames before the first that is not finite, or in which a part of the garment has come off."""
+    lost = [reason.frames[0][0] for reason in verdict.reasons if reason.kind in ("not_worn", "not_finite") and reason.frames]
+    return min([count, *lost]) / count
 
 
 def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[MeasuredRollout]]) -> list[dict[str, Any]]:
@@ -271,7 +282,7 @@ def candidate_rows(candidate: Candidate, parts: Mapping[str, Sequence[MeasuredRo
 
 def other_terms(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """Energies that act in some of the rows beside :data:`TERMS`, own ones among them: their columns are ``L_NAME``."""
-    known = {f"L_{name}" for name in (*_SUMS, "guess", "total_low", "total_high")}
+    known = {f"L_{name}" for name in (*_SUMS, "guess", "states", "above", "total_low", "total_high")}
     columns = (key for row in rows for key in row if key.startswith("L_") and key not in known)
     return tuple(dict.fromkeys(column.removeprefix("L_") for column in columns))
 
@@ -309,7 +320,9 @@ def _run(
     for index, (problem, prediction) in enumerate(sample.steps):
         yield f"gap {index + 1}/{len(sample.steps)}"
         found = gap(potential, problem, prediction.next_pos, settings=gaps.reference)
-        into.gaps.append({"gamma": float(found.gamma), "converged": float(found.converged), "spread": float(found.spread)})
+        numbers = {"gamma": found.gamma, "converged": found.converged, "spread": found.spread}
+        numbers |= {"phi": found.phi, "above": found.phi - found.reference}
+        into.gaps.append({name: float(value) for name, value in numbers.items()})
         if bands is not None:
             into.spectra.append(error_spectrum(potential, problem, prediction.next_pos, bands, gaps.reference))
 
@@ -318,6 +331,8 @@ def _row(measured: MeasuredRollout) -> dict[str, Any]:
     frames, failures = measured.frames, measured.failures
     row: dict[str, Any] = {"frames": len(frames), "failed_at": min(failures) if failures else None}
     row |= _failure_columns(measured.ends) | _verdict_columns(measured.kinds) | _gap_columns(measured.gaps)
+    if measured.worn:
+        row["worn"] = float(np.mean(measured.worn))
     if measured.drifts:
         row["drift"] = max(measured.drifts)
     if not frames:
@@ -397,7 +412,10 @@ def _gap_columns(gaps: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     gamma = np.array([item["gamma"] for item in gaps])
     spread = np.array([item["spread"] for item in gaps])
     known = spread[np.isfinite(spread)]
-    return {
+    told = [item for item in gaps if "above" in item]  # logs of earlier versions do not say
+    totals = {"L_states": float(np.median([item["phi"] for item in told]))} if told else {}
+    totals |= {"L_above": float(np.median([item["above"] for item in told]))} if told else {}
+    return totals | {
         "gap": float(np.median(gamma)),
         "gap_p95": float(np.quantile(gamma, 0.95)),
         "unconverged": float(np.mean([item["converged"] == 0.0 for item in gaps])),

@@ -236,7 +236,9 @@ class StepFigures:
         if known.names is not None:
             others, step = rest, problem.step
             parts = known.forces.compiled.add(pos, acc, problem.cloth.vertex_scene, step.dt, gradient)
-            energies |= {name: value for name, value in zip(known.names, parts[:, 0].tolist(), strict=True) if name}
+            for name, value in zip(known.names, parts[:, 0].tolist(), strict=True):
+                if name:  # contact on both sides of a fold is two parts of one term
+                    energies[name] = energies.get(name, 0.0) + value
         if not others.active(problem):
             return energies
         place, given = (torch.from_numpy(values).to(problem.state.pos) for values in (pos, acc))

@@ -20,6 +20,7 @@ from hood.evaluation.table import ALL, TERMS, Candidate, GapSettings, evaluate, 
 from hood.evaluation.table_one import TableConditions, page
 from hood.evaluation.validation import Validation
 from hood.rollouts.loop import simulate
+from hood.rollouts.verdict.rule import Reason, Verdict
 from hood.scene.scene import Scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.network import build_simulator
@@ -64,6 +65,17 @@ def test_the_verdict_is_that_of_the_rule_and_what_it_does_not_judge_is_not_sound
     assert columns_of([[], None, ["strain", "strain", "distance"], ["strain"]]) == {
         "sound": pytest.approx(1 / 3), "unsound_for": "strain 2, distance 1",
     }  # fmt: skip
+
+
+def test_what_gamma_is_in_joules_and_how_long_the_cloth_was_worn(rows: list[dict], solver_rows: list[dict]) -> None:
+    newton, _, guess, _ = solver_rows
+    assert 0 <= newton["L_above"] < 1e-3 * guess["L_above"]
+    assert guess["L_states"] > newton["L_states"] + 0.9 * guess["L_above"]
+    assert [row["worn"] for row in rows if row["model"] == "base"] == [1.0] * 3
+    assert all(0 < row["worn"] < 1 for row in rows if row["model"] == "wild")
+    off = Reason("not_worn", "", ((4, 9),)), Reason("strain", "", ((0, 1),))
+    assert table._worn_share(Verdict(False, off), 10) == 0.4
+    assert table._worn_share(Verdict(False, off[1:]), 10) == 1.0
 
 
 def test_one_row_per_model_and_garment_and_one_over_all(rows: list[dict]) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Attachments
+from hood.contact.contact import SecondContact
 from hood.energies import compiled_elements
 from hood.energies.mass_points import Attachment, Gravity
 from hood.energies.potential import Potential, default_potential, relative_gradient, scale
@@ -37,6 +38,12 @@ def sliding(pinned: bool, dtype: torch.dtype = torch.float64) -> tuple[StepProbl
     return replace(problem, step=step), moved.to(dtype)
 
 
+def in_a_fold(problem: StepProblem) -> StepProblem:
+    """The same sheet between the plane and another one, 3 mm above it."""
+    pos = problem.state.pos
+    return replace(problem, second_contact=SecondContact(plane_contact(pos, torch.tensor([0.0, -1.0, 0.0]), -3e-3)))
+
+
 def expected(potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor) -> dict[str, float]:
     gradient, energies = potential.gradient(problem, pos, acc)
     free = problem.cloth.free
@@ -55,6 +62,7 @@ def expected(potential: Potential, problem: StepProblem, pos: Tensor, acc: Tenso
 
 @pytest.mark.parametrize("form", ["compiled", "torch"])
 @pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize("fold", [False, True])
 @pytest.mark.parametrize(
     "potential",
     [
@@ -66,7 +74,7 @@ def expected(potential: Potential, problem: StepProblem, pos: Tensor, acc: Tenso
     ids=["default", "points", "two of a kind", "springs alone"],
 )
 def test_figures_are_those_of_the_potential(
-    potential: Potential, pinned: bool, form: str, monkeypatch: pytest.MonkeyPatch
+    potential: Potential, fold: bool, pinned: bool, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if form == "torch":
         for module in (compiled_elements, compiled_vertices):
@@ -74,8 +82,11 @@ def test_figures_are_those_of_the_potential(
     elif compiled_elements.library() is None:
         pytest.skip("no C++ compiler")
     problem, pos = sliding(pinned)
-    problem = potential.prepare(problem)
+    problem = potential.prepare(in_a_fold(problem) if fold else problem)
     acc = problem.acceleration(pos)
+    if fold and "collision" in potential.terms:
+        (below, above), term = problem.contacts, potential.terms["collision"]
+        assert min(float(term.depth(problem, one, pos)[0].max()) for one in (below, above)) > 0  # both press
     figures, wanted = StepFigures(potential, problem, pos, acc), expected(potential, problem, pos, acc)
     assert list(figures.metrics()) == list(wanted)
     assert figures.metrics() == pytest.approx(wanted, rel=1e-10, abs=1e-15)
