@@ -17,7 +17,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.app.batch.batch import expand_sequences, require_motions
+from hood.app.batch.batch import require_motions
 from hood.app.candidates import conditions, digest, distinct, make_candidate
 from hood.app.common import (
     held_folder,
@@ -37,6 +37,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import motion_split
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
+from hood.assets.motion.motion_files import find_motions
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import build_cloth
 from hood.energies.potential import Potential
@@ -258,7 +259,7 @@ def _make_plan(config: DictConfig) -> Plan:
         raise ConfigError(f"models={plain(config.models)}: names must differ, these are {', '.join(titles)}; rename a file")
     sequences = [str(name) for name in config.sequences]
     require_motions("sequences", sequences)
-    motions = expand_sequences(sequences) or motion_split()["validation"]
+    motions = find_motions(sequences) or motion_split()["validation"]
     garments = [as_simulated(load_garment(str(name))) for name in config.garments]
     names = [garment.name for garment in garments]
     if len(set(names)) < len(names):

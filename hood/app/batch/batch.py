@@ -25,7 +25,7 @@ from hood.app.stepping.automatic import AUTO, choose, decided
 from hood.app.stepping.steppers import with_stepper
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import locate
-from hood.assets.motion.motion_files import find_motions, motions_in
+from hood.assets.motion.motion_files import LISTS, find_motions
 from hood.training import distributed
 
 _NAME = "summary.json"
@@ -120,19 +120,6 @@ class Outcome:
     hopeless: OSError | None  # the disk refused
 
 
-def expand_sequences(entries: Sequence[str]) -> list[str]:
-    """Names and files that ``entries`` stand for: names, files, globs, lists of them, or folders with all motions below them.
-
-    Raises:
-        ValueError: nothing found.
-    """
-    found: dict[str, None] = {}
-    for entry in entries:
-        folder = Path(entry).expanduser()
-        found.update(dict.fromkeys(map(str, motions_in(folder)) if folder.is_dir() else find_motions([entry])))
-    return list(found)
-
-
 def require_motions(key: str, entries: Sequence[str]) -> None:
     """Refuse names of motions that are not there, before any of them is used; lists and globs are looked through elsewhere.
 
@@ -140,7 +127,7 @@ def require_motions(key: str, entries: Sequence[str]) -> None:
         FileNotFoundError: names the key, the index and the nearest name.
     """
     for index, entry in enumerate(entries):
-        if has_magic(entry) or Path(entry).suffix in (".txt", ".json") or Path(entry).expanduser().is_dir():
+        if has_magic(entry) or Path(entry).suffix.lower() in LISTS or Path(entry).expanduser().is_dir():
             continue
         try:
             locate("motions", entry)
@@ -156,8 +143,8 @@ def find_jobs(entry: str, output: Path, root: str | None = None) -> list[Job] | 
         ConfigError: two motions would share a folder, or another motion is in one; ``root`` does not hold the motions, or
             there is one motion only; one rollout would meet those of many in ``output``.
     """
-    plain_file = Path(entry).expanduser().is_file() and Path(entry).suffix not in (".txt", ".json")
-    found = [entry] if plain_file else expand_sequences([entry])
+    plain_file = Path(entry).expanduser().is_file() and Path(entry).suffix.lower() not in LISTS
+    found = [entry] if plain_file else find_motions([entry])
     if found == [entry]:
         if root is not None:
             raise ConfigError(f"root={root}: names the folders of many motions, and sequence={entry} is one; drop root")

@@ -167,7 +167,9 @@ def todays_words(words: Sequence[str], command: str = "rollout") -> tuple[str, .
 
 
 def put_todays_keys(record: dict[str, Any]) -> None:
-    """Put today's keys into the record of a rollout, in place of earlier ones; others stay as they are."""
+    """Put today's keys into the record of a rollout, in place of earlier ones; those of other commands stay as they are."""
+    if "sequence" not in record:  # trainings and evaluations have sequences, and keys of their own by some of these names
+        return
     for key, old in _OLD.items():
         value = old.value(record[key], record) if key in record else None
         if value is not None:

@@ -32,15 +32,18 @@ from hood.assets.motion.sequence import PoseSequence
 
 #: Parts of a split.
 _PARTS = ("train", "validation")
-_LISTS = (".json", ".txt")
+#: Suffixes of files that name motions.
+LISTS = (".json", ".txt", ".csv")
 
 
 def find_motions(entries: Iterable[str], part: str = "train", check: bool = True) -> list[str]:
     """Names and files that ``entries`` stand for, in their order, globs sorted, nothing twice.
 
-    An entry is the name of an embedded motion, a file, a glob (``amass/**/*_poses.npz``), or a list of such entries: a text
-    file with one entry a line (``#`` starts a comment), a JSON list, or a JSON split
-    ``{"train": […], "validation": […]}`` of which ``part`` is taken. Relative paths in a list start from its folder.
+    An entry is the name of an embedded motion, a file, a folder with its motions as in :func:`motions_in`, a glob
+    (``amass/**/*_poses.npz``), or a list of such entries: a text file with one entry a line (``#`` starts a comment), a JSON
+    list, a JSON split ``{"train": […], "validation": […]}`` of which ``part`` is taken, or a ``.csv`` table with a column
+    ``id`` (or file, path, sequence, name; else its first) of files with or without suffix. Relative paths in a list start from
+    its folder.
 
     Args:
         check: refuse a list with a name that stands for nothing; False where that is left out later.
@@ -48,7 +51,7 @@ def find_motions(entries: Iterable[str], part: str = "train", check: bool = True
     Raises:
         FileNotFoundError: a list that does not exist; an entry of a list that is neither a file nor an embedded name: names the
             list, the line (or the index) and the nearest name.
-        ValueError: a glob without a match, a list that cannot be read or lacks the part; names the file.
+        ValueError: a glob without a match, a folder without motions, a list that cannot be read or lacks the part; names it.
     """
     found: dict[str, None] = {}
     for entry in map(str, entries):
@@ -157,8 +160,10 @@ def motion_lengths(motions: Sequence[PoseSequence]) -> np.ndarray:
 
 def _expand(entry: str, part: str, check: bool) -> list[str]:
     path = Path(entry).expanduser()
-    if path.suffix not in _LISTS:
-        return _matches(path) if has_magic(entry) else [_no_folder(path, entry)]
+    if path.suffix.lower() == ".csv":
+        return _in_table(path, check)
+    if path.suffix not in LISTS:
+        return _matches(path) if has_magic(entry) else _files_of(path, entry)
     found: list[str] = []
     for place, text in _entries(path, part):
         try:
@@ -175,7 +180,8 @@ def _listed(entry: str, folder: Path, check: bool) -> list[str]:
     based = folder / path
     if has_magic(entry):
         return _matches(based)
-    _no_folder(based, entry)
+    if based.is_dir():
+        return _files_of(based, entry)
     is_path = path.suffix in motion_suffixes()
     if based.is_file() or (is_path and not check):
         return [str(based)]
@@ -195,10 +201,9 @@ def _matches(path: Path) -> list[str]:
     return files
 
 
-def _no_folder(path: Path, entry: str) -> str:
-    if path.is_dir():
-        raise ValueError(f"{path}: a folder; write which files in it, e.g. '{path}/**/*_poses.npz'")
-    return entry
+def _files_of(path: Path, entry: str) -> list[str]:
+    """The motions of a folder; itself where it is none."""
+    return [str(file) for file in motions_in(path)] if path.is_dir() else [entry]
 
 
 def _entries(path: Path, part: str) -> list[tuple[str, str]]:
@@ -271,33 +276,6 @@ _OFTEN_OTHERS = (*ARRAYS, *TENSORS)
 _NAME_COLUMNS = ("id", "file", "path", "sequence", "name")
 
 
-def expand_motions(patterns: str | Path | Iterable[str | Path], part: str = "train") -> list[Path]:
-    """Motion files that ``patterns`` stand for: in their order, folders and globs sorted, nothing twice.
-
-    A pattern is the name of an embedded motion; a file; a folder, with its motions as in :func:`motions_in`; a glob
-    (``amass/**/*_poses.npz``); a list, see :func:`hood.assets.motion.motion_files.find_motions`; or a ``.csv`` table with a
-    column ``id`` (or file, path, sequence, name; else its first), whose entries start from its folder, with or without suffix.
-
-    Args:
-        part: of a JSON split, "train" or "validation".
-
-    Raises:
-        FileNotFoundError: an unknown name, a missing file or list.
-        ValueError: nothing found for a pattern, or an unreadable list; names it.
-    """
-    found: dict[Path, None] = {}
-    for pattern in [patterns] if isinstance(patterns, (str, Path)) else patterns:
-        path = Path(pattern).expanduser()
-        if path.is_dir():
-            files = motions_in(path)
-        elif path.suffix.lower() == ".csv":
-            files = _in_table(path)
-        else:
-            files = [locate("motions", name) for name in find_motions([str(pattern)], part)]
-        found.update(dict.fromkeys(files))
-    return list(found)
-
-
 def motions_in(folder: Path) -> list[Path]:
     """Motion files in a folder and below, sorted: archives, pickles and what plugins read, without the shapes and stages of the
     fit that AMASS keeps beside them; where there are none, arrays and files of torch.
@@ -315,7 +293,7 @@ def motions_in(folder: Path) -> list[Path]:
     return found
 
 
-def _in_table(path: Path) -> list[Path]:
+def _in_table(path: Path, check: bool) -> list[str]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
@@ -325,20 +303,19 @@ def _in_table(path: Path) -> list[Path]:
     if not rows:
         raise ValueError(f"{path}: an empty table; give one row per motion below a row of column names")
     column = next((name for name in _NAME_COLUMNS if name in rows[0]), next(iter(rows[0])))
-    names = [row[column] for row in rows]
-    if any(not name for name in names):
-        raise ValueError(f"{path}: row {next(i for i, name in enumerate(names) if not name) + 2} names no motion in {column!r}")
-    return [_beside(path, row, str(name)) for row, name in enumerate(names, start=2)]
+    found = []
+    for row, entry in enumerate(rows, start=2):
+        name = str(entry[column] or "")
+        if not name:
+            raise ValueError(f"{path}: row {row} names no motion in {column!r}")
+        try:
+            found += _listed(_with_suffix(path.parent, name), path.parent, check)
+        except (ValueError, OSError) as error:
+            kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+            raise kind(f"{path}, row {row}: {error}") from error
+    return found
 
 
-def _beside(table: Path, row: int, name: str) -> Path:
-    """File of a table's entry: beside the table, with or without its suffix, or an embedded motion."""
-    for suffix in ("", *motion_suffixes()):
-        file = table.parent / (name + suffix)
-        if file.is_file():
-            return file
-    try:
-        return locate("motions", name)
-    except (ValueError, OSError) as error:
-        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
-        raise kind(f"{table}, row {row}: {error}") from error
+def _with_suffix(folder: Path, name: str) -> str:
+    """The name of a file in a folder, given with or without its suffix."""
+    return next((name + suffix for suffix in ("", *motion_suffixes()) if (folder / (name + suffix)).is_file()), name)

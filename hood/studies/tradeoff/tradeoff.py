@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from hood.app.batch.batch import expand_sequences, require_motions
+from hood.app.batch.batch import require_motions
 from hood.app.candidates import device_name
 from hood.app.common import (
     UNTRAINED,
@@ -32,6 +32,7 @@ from hood.app.stepping.steppers import find_option
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate, names
 from hood.assets.garment.garment import load_garment
+from hood.assets.motion.motion_files import find_motions
 from hood.evaluation.files import write_rows
 from hood.evaluation.table import GUESS, NEWTON, model_name
 from hood.steppers.checkpoint import read_header
@@ -66,7 +67,7 @@ def _check_config(config: DictConfig, sizes: Sequence[str]) -> None:
         check_precision(str(precision), torch.device(str(config.device)))
     sequences = [str(name) for name in config.sequences]
     require_motions("sequences", sequences)
-    motions = expand_sequences(sequences)
+    motions = find_motions(sequences)
     if not motions:
         raise ConfigError("sequences=[]: give motions")
     require_distinct("sequences", motions)
@@ -188,7 +189,7 @@ def make_grid(config: DictConfig, models: Sequence[str]) -> Grid:
     sizes = tuple(_size(config, name, models) for name in SIZES)
     precisions, methods = (tuple(map(str, config[key])) for key in ("precisions", "refine_methods"))
     settings = (*shared, *(str(text) for text in config.settings))
-    motions = len(expand_sequences(sequences))
+    motions = len(find_motions(sequences))
     return Grid(tuple(models), precisions, methods, sizes, settings, bool(config.newton), motions)
 
 

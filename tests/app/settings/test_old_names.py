@@ -278,8 +278,16 @@ def test_a_file_is_inspected_with_the_same_words() -> None:
 
 
 def test_the_record_in_a_folder_is_read_so(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump({**THEN, "settle": "paper", "relaxing_steps": 2}))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({**THEN, "sequence": "plie", "settle": "paper", "relaxing_steps": 2}))
     assert read_record(tmp_path / "config.yaml")["settle"] == 2
+
+
+def test_records_of_other_commands_keep_their_keys() -> None:
+    for command, word in (("evaluate", "refine_method=sweeps"), ("train", "data.trans_unit=cm")):
+        record = plain(load_config(command, [word]))
+        kept = dict(record)
+        put_todays_keys(record)
+        assert record == kept
 
 
 def test_a_plan_of_then_is_followed(tmp_path: Path) -> None:
