@@ -200,7 +200,7 @@ def test_starts_are_shaken_by_millimetres(body: Body, skirt: Garment, walk: Pose
 
 @pytest.mark.parametrize("frames", [True, False])
 def test_networks_and_energies_are_told_of_the_same_way(frames: bool, body: Body, skirt: Garment, walk: PoseSequence) -> None:
-    """The noise is a way x_t − x_{t−1}, of a frame for the network and in the inertia of a relaxing step: free flight goes on by it."""
+    """The noise is a way x_t − x_{t−1}: what the network sees in a frame, and where free flight goes on in a relaxing step."""
     sampler = sampler_of(body, skirt, walk, noise=3e-3)
     model = tiny(**FRAMES) if frames else tiny()
     slots = Slots(sampler, model, 1, 0, 4, whole=True)
