@@ -278,7 +278,7 @@ def _as_known(there: dict[str, Any], here: dict[str, Any]) -> dict[str, Any]:
     for key, value in here.items():
         if key in there:
             kept[key] = _as_known(there[key], value) if isinstance(value, dict) and isinstance(there[key], dict) else value
-        elif value and not (key in parameters and parameters[key].default == value):
+        elif value is not None and value != (parameters[key].default if key in parameters else type(value)()):
             kept[key] = value
     return kept
 

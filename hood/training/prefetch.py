@@ -50,7 +50,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Start:
-    """A scene and the state before its relaxing step, on the CPU."""
+    """A scene and the state before its first step, on the CPU; its velocity is the way of the frame before."""
 
     window: Window
     state: State
@@ -66,12 +66,22 @@ def make_start(sampler: SceneSampler, request: Request) -> Start:
     """The scene that was asked for; the last attempt is taken as it is, and so is the first where starts are not settled."""
     for attempt, garment in enumerate(request.garments):
         window = draw_window(sampler, request.seed, request.slot, request.draw + attempt, garment, request.num_steps)
-        state = sampler.start(window)
+        state = window.scene.start(window.start_frame, relaxed=False, by_centroids=sampler.by_centroids)
         strain = edge_strain(window.scene.cloth, state.pos).abs()
         if sampler.by_centroids or float((strain > _BAD_START).double().mean()) < 0.02:
             break
     shaking = np.random.default_rng([request.seed, request.slot, request.draw + attempt, _NOISE])
-    return Start(window, sampler.shaken(window, state, shaking), attempt + 1)
+    return Start(window, _shaken(sampler, window, state, shaking), attempt + 1)
+
+
+def _shaken(sampler: SceneSampler, window: Window, state: State, rng: np.random.Generator) -> State:
+    """``state`` with the sampler's noise: on x_t in its positions, and that of both times in its velocity, the way from x_{t−1}
+    over the dt of a regular step."""
+    if sampler.noise == 0:
+        return state
+    now, before = torch.as_tensor(sampler.noise * rng.normal(size=(2, *state.pos.shape))).to(state.pos)
+    shaking = sampler.noise_on_pinned | ~window.scene.cloth.pinned[:, None]
+    return State(state.pos + now * shaking, state.vel + (now - before) * shaking / window.scene.dt, state.origin)
 
 
 class SceneFeed:

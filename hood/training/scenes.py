@@ -20,7 +20,6 @@ from hood.assets.material import RANGES, Material, sample_material
 from hood.assets.motion.motion_files import MotionFiles, motion_lengths
 from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.cloth.cloth import Cloth
-from hood.cloth.state import State
 from hood.scene.body_motion.motion import BodyMotion, body_motion
 from hood.scene.holding import fastening_of
 from hood.scene.scene import Scene, dress
@@ -141,21 +140,6 @@ class SceneSampler:
         scene = dress(worn, body_motion(body, window, betas), material, size)
         still = self.still_fraction > 0 and rng.random() < self.still_fraction
         return Window(scene, min(start, 1), index, mirrored, still)
-
-    def start(self, window: Window) -> State:
-        """The state with which the first step of a window begins, at rest, before any noise."""
-        return window.scene.start(window.start_frame, relaxed=False, by_centroids=self.by_centroids)
-
-    def shaken(self, window: Window, state: State, rng: np.random.Generator) -> State:
-        """``state`` with the noise of the sampler: on x_t in its positions, and both times' in its velocity, the way from
-        x_{t−1} over the dt of a regular step."""
-        if self.noise == 0:
-            return state
-        cloth = window.scene.cloth
-        now, before = torch.as_tensor(self.noise * rng.normal(size=(2, *state.pos.shape))).to(state.pos)
-        shaking = torch.ones_like(cloth.pinned) if self.noise_on_pinned else ~cloth.pinned
-        now, before = now * shaking[:, None], before * shaking[:, None]
-        return State(state.pos + now, state.vel + (now - before) / window.scene.dt, state.origin)
 
     def pack(self, window: Window) -> dict[str, Any]:
         """A sampled window as plain arrays, without the body and the garment that every process has; surfaces posed."""

@@ -91,6 +91,7 @@ class _Slot:
     draws: int = 0
     age: int = 0
     length: int | None = None  # steps after the relaxing one; None: as many as the horizon of the moment
+    still: bool = False  # there is no relaxing step: the first one is a regular one on a still body
     window: Window | None = None
     state: State | None = None
     prepared: Prepared | None = None
@@ -152,9 +153,7 @@ class Slots:
         for index, slot in slots.items():
             # Step 0 is the relaxing step; ``horizon`` regular steps follow it.
             if slot.window is None or slot.age > (horizon if slot.length is None else slot.length):
-                self._reset(index, slot)
-                slot.length = horizon if self.whole else None
-                slot.state = self._begun(slot, horizon)
+                self._reset(index, slot, horizon)
         states, steps, counts = [], [], []
         for slot in slots.values():
             assert slot.window is not None
@@ -164,7 +163,7 @@ class Slots:
             frame = slot.window.start_frame + max(slot.age - 1, 0)
             states.append(slot.state)
             step = scene.step_input(frame, slot.state, relaxing=first)
-            if first and _is_still(slot, horizon):
+            if first and slot.still:
                 step = replace(step, dt=torch.full_like(step.dt, scene.dt))
             steps.append(step)
             counts.append(scene.cloth.num_vertices)
@@ -197,7 +196,7 @@ class Slots:
             offset = rows.stop
             pos, vel = next_pos[rows].detach(), next_vel[rows].detach()
             if slot.age == 0:
-                vel = self._relaxed(slot.window, vel)
+                vel = self._relaxed(slot, vel)
             slot.state = State(pos, vel, slot.state.origin)
             slot.age += 1
             if not bool(torch.isfinite(pos).all()) or not self.whole and _is_debris(scene.cloth, pos):
@@ -248,11 +247,14 @@ class Slots:
         number = next_bucket(self.buckets, self._turns)
         return number, {index: slot for index, slot in self._slots.items() if slot.bucket == number}
 
-    def _reset(self, index: int, slot: _Slot) -> None:
+    def _reset(self, index: int, slot: _Slot, horizon: int) -> None:
         start = self.feed.take(self._request(index, slot))
         device = self.sampler.device
         slot.window = start.window.to(device)
-        slot.state = State(start.state.pos.to(device), start.state.vel.to(device), start.state.origin)
+        slot.length, slot.still = horizon if self.whole else None, slot.window.still and horizon == 0
+        # The way of the frame before, as a velocity in the time of the first step.
+        vel = start.state.vel if self._in_frames(slot) else start.state.vel * (slot.window.scene.dt / RELAXING_DT)
+        slot.state = State(start.state.pos.to(device), vel.to(device), start.state.origin)
         slot.draws += start.draws
         slot.prepared = self._prepare(slot.window)
         slot.age = 0
@@ -270,31 +272,23 @@ class Slots:
         garments = tuple(bucket.template(slot.place, slot.draws + attempt) for attempt in range(MAX_DRAWS))
         return Request(self.seed, index, slot.draws, garments, self.max_horizon + 1)
 
-    def _begun(self, slot: _Slot, horizon: int) -> State:
-        """The state of a scene that begins; the way of the frame before is a velocity in the time of the first step."""
-        assert slot.window is not None
-        assert slot.state is not None
-        state, frame = slot.state, self.simulator.rules.frame_dt
-        if frame is not None or _is_still(slot, horizon):
-            return state
-        return State(state.pos, state.vel * (slot.window.scene.dt / RELAXING_DT), state.origin)
+    def _in_frames(self, slot: _Slot) -> bool:
+        """Whether velocities of the first step are those of a frame."""
+        return self.simulator.rules.frame_dt is not None or slot.still
 
-    def _relaxed(self, window: Window, vel: Tensor) -> Tensor:
-        """Velocity (V, 3) [m/s] after the relaxing step, of which the simulator says ``vel``."""
+    def _relaxed(self, slot: _Slot, vel: Tensor) -> Tensor:
+        """Velocity (V, 3) [m/s] after the first step, of which the simulator says ``vel``."""
+        window = slot.window
+        assert window is not None
         if self.relaxed_velocity == "skinned":
             return window.scene.start_velocity(window.start_frame)
         if self.relaxed_velocity == "zero":
             return torch.zeros_like(vel)
-        return vel if self.simulator.rules.frame_dt is not None else vel * (RELAXING_DT / window.scene.dt)
+        return vel if self._in_frames(slot) else vel * (RELAXING_DT / window.scene.dt)
 
     def _prepare(self, window: Window) -> Prepared:
         # A mirrored scene has the levels of its template: they are then the image of the original's, and found once.
         return self.simulator.prepare(window.scene.cloth, self.sampler.garments[window.template].rest_pos)
-
-
-def _is_still(slot: _Slot, horizon: int) -> bool:
-    """Whether the only step of a rollout is a regular one with a body that stands still."""
-    return slot.window is not None and slot.window.still and horizon == 0
 
 
 def _is_debris(cloth: Cloth, pos: Tensor) -> bool:
