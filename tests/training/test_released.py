@@ -131,6 +131,9 @@ def roll(slots: Slots, horizons: Sequence[int]) -> list[tuple[float, bool, Tenso
 
 def test_rollouts_of_one_step_relax_or_hold_the_body_still(body: Body, skirt: Garment, walk: PoseSequence) -> None:
     sampler = sampler_of(body, skirt, walk, still_fraction=0.5)
+    windows = [sampler.sample(np.random.default_rng(seed), 5) for seed in range(8)]
+    assert [sampler.unpack(sampler.pack(window)).still for window in windows] == [window.still for window in windows]
+    assert {window.still for window in windows} == {True, False}
     seen = roll(Slots(sampler, tiny(**FRAMES), 1, 0, 4, whole=True), [0] * 24)
     assert all(still for _, still, *_ in seen)
     dts = [dt for dt, *_ in seen]
