@@ -43,6 +43,16 @@ def test_what_differs_is_in_the_table() -> None:
         assert differences(paper[group], released[group], group) <= keys
 
 
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_what_the_text_below_says(experiment: str) -> None:
+    config = load_config("train", [f"experiment={experiment}"])
+    assert (config.trainer.clip_norm, config.trainer.statistics_iterations) == (1.0, 100)
+    of_paper = experiment != "quickstart"
+    assert (config.trainer.optimizer == "adam") == of_paper
+    assert config.data.sampling.mirror == config.data.sampling.random_yaw == (not of_paper)
+    assert (config.losses == load_config("train", ["losses=reference_as_coded"]).losses) == (experiment == "released")
+
+
 def differences(first: dict, second: dict, path: str) -> set[str]:
     found: set[str] = set()
     assert first.keys() == second.keys()
