@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from hydra.utils import get_object
 from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, brief, load_config, plain, require_choice, shown
@@ -255,6 +257,7 @@ def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], f
             continue
         there, here = plain(before.get(key)), plain(config[key])
         if isinstance(there, dict) and isinstance(here, dict):
+            here = _as_known(there, here)
             # A key that is newer than the record is null where nobody asks for anything.
             there, here = (
                 {name: item for name, item in side.items() if name not in free_below and item is not None}
@@ -266,6 +269,18 @@ def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], f
                 f"{record}: {name} is {shown(there)} there, {shown(here)} in this command; resume with the same settings or "
                 "use another output"
             )
+
+
+def _as_known(there: dict[str, Any], here: dict[str, Any]) -> dict[str, Any]:
+    """``here`` without the keys that are newer than the record and ask for nothing: off, or what their class does anyway."""
+    parameters = inspect.signature(get_object(here["_target_"])).parameters if "_target_" in here else {}
+    kept = {}
+    for key, value in here.items():
+        if key in there:
+            kept[key] = _as_known(there[key], value) if isinstance(value, dict) and isinstance(there[key], dict) else value
+        elif value is not None and value != (parameters[key].default if key in parameters else type(value)()):
+            kept[key] = value
+    return kept
 
 
 def _difference(name: str, there: Any, here: Any) -> tuple[str, Any, Any]:

@@ -34,6 +34,7 @@ in every direction. B is the mean of warp and weft.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -159,24 +160,29 @@ def first_bad(good: np.ndarray) -> int | None:
 
 
 def sample_material(
-    rng: np.random.Generator, pos: np.ndarray | None = None, piecewise_fraction: float = 0.0, num_pieces: int = 3
+    rng: np.random.Generator,
+    pos: np.ndarray | None = None,
+    piecewise_fraction: float = 0.0,
+    num_pieces: int = 3,
+    uniform: Collection[str] = (),
 ) -> Material:
-    """A fabric drawn log-uniformly from :data:`RANGES` (paper, section 4.3).
+    """A fabric drawn log-uniformly from :data:`RANGES` (paper, section 4.3); the properties ``uniform`` are drawn uniformly.
 
     With probability ``piecewise_fraction`` the garment ``pos`` (V, 3) is cut into up to ``num_pieces`` parts (Voronoi cells
     of random vertices) with a fabric each; the result then holds fields of shape (V,).
     """
     if pos is None or rng.random() >= piecewise_fraction:
-        return Material(**{name: _log_uniform(rng, *span) for name, span in RANGES.items()})
+        return Material(**{name: _drawn(rng, name, uniform) for name in RANGES})
     pieces = int(rng.integers(2, num_pieces + 1))
     seeds = pos[rng.choice(len(pos), size=pieces, replace=False)]
     piece = np.argmin(((pos[:, None, :] - seeds[None]) ** 2).sum(-1), axis=1)
-    values = {name: np.array([_log_uniform(rng, *span) for _ in range(pieces)]) for name, span in RANGES.items()}
+    values = {name: np.array([_drawn(rng, name, uniform) for _ in range(pieces)]) for name in RANGES}
     return Material(**{name: table[piece] for name, table in values.items()})
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+def _drawn(rng: np.random.Generator, name: str, uniform: Collection[str]) -> float:
+    low, high = RANGES[name]
+    return float(rng.uniform(low, high) if name in uniform else np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 #: Gravity [m/s²] of the bending length, and the largest Poisson ratio that is used.

@@ -23,6 +23,8 @@ weft, shear → the columns of ``cloth.weave``. The first column of ``cloth.rest
 
 from __future__ import annotations
 
+import weakref
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -31,6 +33,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
+from hood.tensors.weak_cache import forget
 
 
 def weave_roots(cloth: Cloth, dtype: torch.dtype | None = None) -> Tensor | None:
@@ -108,6 +111,51 @@ class Stretching(Energy):
 
     def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> bool:
         return True
+
+
+class CodedStretching(Stretching):
+    """The membrane energy [J] with which the published weights Fine15 and Fine48 were trained: λ times the bending stiffness.
+
+    The fabric's constants reach their code in another order than it takes them, and a product in place multiplies λ by the
+    bending stiffness k [J] as a number. The default fabric has 1.76 Pa in place of 44,400 Pa: cloth that resists shear and
+    stretch by μ alone. Networks are shown the fabric as it is, λ included; so they do not learn what softens it, k apart.
+
+    A fabric has one value a garment there. Of one that varies a face has the mean of λ k at its corners.
+    """
+
+    kind: ClassVar[str] = "CodedStretching"
+    form = Form.MEMBRANE
+
+    def prepare(self, problem: StepProblem) -> StepProblem:
+        """The problem with the λ of this energy in its cloth; the fabric that networks are shown stays. Itself where that is
+        done."""
+        cloth = softened(problem.cloth)
+        return problem if cloth is problem.cloth else replace(problem, cloth=cloth)
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        return super().__call__(self.prepare(problem), next_pos, acc)
+
+
+#: Cloths that :func:`softened` was asked about and what it made, and those that it made itself, as long as the former live.
+_SOFTENED: dict[int, tuple[weakref.ref[Cloth], Cloth]] = {}
+_MADE: dict[int, weakref.ref[Cloth]] = {}
+
+
+def softened(cloth: Cloth) -> Cloth:
+    """The cloth with λ k in place of λ in its energies, one and the same object whenever asked; what it made, itself."""
+    key = id(cloth)
+    made, known = _MADE.get(key), _SOFTENED.get(key)
+    if made is not None and made() is cloth:
+        return cloth
+    if known is not None and known[0]() is cloth:
+        return known[1]
+    # From the fabric at vertices, which stays: a cloth that was softened and then copied is not softened twice.
+    product = cloth.vertex_fabric[:, 1] * cloth.vertex_fabric[:, 2]
+    soft = replace(cloth, lame_lambda=product[cloth.faces].mean(dim=1))
+    _SOFTENED[key] = weakref.ref(cloth, forget(_SOFTENED, key)), soft
+    _MADE[id(soft)] = weakref.ref(soft, forget(_MADE, id(soft)))
+    return soft
 
 
 def membrane_density(cloth: Cloth, strain: tuple[Tensor, Tensor, Tensor]) -> Tensor:

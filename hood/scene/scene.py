@@ -17,7 +17,7 @@ from hood.cloth.state import Attachments, Obstacle, State, StepInput
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
 from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
-from hood.scene.start import free_stretch, settle
+from hood.scene.start import free_stretch, leave_by_centroids, settle
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 from hood.scene.worn import worst_part
 from hood.tensors.batch import to_device
@@ -70,11 +70,12 @@ class Scene:
         """Frames of the motion; a rollout has at most as many."""
         return self.motion.num_frames
 
-    def start(self, frame: int = 0, relaxed: bool = True, thorough: bool = False) -> State:
+    def start(self, frame: int = 0, relaxed: bool = True, thorough: bool = False, by_centroids: bool = False) -> State:
         """State at ``frame``: garment skinned to the body, settled; velocity of the skinned garment.
 
         ``relaxed=False`` gives zero velocity, the start of a relaxing step; ``thorough`` as in
-        :func:`hood.scene.start.settle`.
+        :func:`hood.scene.start.settle`; ``by_centroids`` takes it out of the body by
+        :func:`hood.scene.start.leave_by_centroids` instead, with its edges as they were skinned.
 
         Raises:
             NotWornError: a thorough start finds the garment passing through the body, as one does that was made for another
@@ -88,7 +89,10 @@ class Scene:
         origin = local_origin(self.motion.translation[frame])
         skinned = self.motion.skinned(self.garment, frame, origin)
         obstacle = self.motion.obstacle(frame, origin, static=True)
-        pos = settle(self.cloth, skinned, obstacle, self.clearance, thorough=thorough)
+        if by_centroids and obstacle is not None:
+            pos = leave_by_centroids(self.cloth, skinned, obstacle, self.clearance)
+        else:
+            pos = settle(self.cloth, skinned, obstacle, self.clearance, thorough=thorough)
         if thorough:
             self._require_worn(frame, skinned, pos)
         return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))

@@ -10,6 +10,8 @@ from hood.cloth.state import Obstacle
 from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact, find_contact
 from hood.limits import STRAIN_START
+from hood.mesh.closest_point.vertices import nearest_centroids
+from hood.mesh.geometry import face_normals
 
 #: Edges may start this much longer or shorter than at rest; beyond it they are projected back.
 _STRAIN_LIMIT = STRAIN_START.value
@@ -46,6 +48,18 @@ def settle(
     """
     pos = _project(cloth, pos, obstacle, clearance, iterations)
     return _unstretch(cloth, pos, obstacle, clearance) if thorough else pos
+
+
+def leave_by_centroids(cloth: Cloth, pos: Tensor, obstacle: Obstacle, clearance: float) -> Tensor:
+    """``pos`` (V, 3) [m] with every free vertex at least ``clearance`` [m] in front of the plane of the body's face at t whose
+    centroid is nearest: how the released code begins. One round; what leaves one limb may enter another."""
+    if len(obstacle.faces) == 0:
+        return pos
+    face, dist = nearest_centroids(pos, cloth.vertex_scene, obstacle.pos, obstacle.faces, obstacle.face_scene)
+    corners = obstacle.faces[face]
+    normal = face_normals(obstacle.pos, corners)
+    depth = clearance - ((pos - obstacle.pos[corners].mean(dim=1)) * normal).sum(dim=1)
+    return pos + (depth.clamp_min(0.0) * torch.isfinite(dist) * cloth.free).unsqueeze(1) * normal
 
 
 def free_stretch(cloth: Cloth, pos: Tensor) -> Tensor:

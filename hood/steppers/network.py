@@ -314,7 +314,7 @@ def build_simulator(
     aggregation: str = "sum",
     body_radius: float = 0.03,
     output_scale: float = 5e-3,
-    output_init: float = 1.0,
+    output_init: float | None = None,
     normalizer_decay: float = 0.999,
     body_velocity: str = "previous",
     embedded_levels: int | None = None,
@@ -350,8 +350,8 @@ def build_simulator(
         body_radius: reach of body edges [m].
         output_scale: displacement [m] of one unit of raw output (``velocity_base``; ``local_steps`` in the first pass; of the
             anchors of ``edges``).
-        output_init: factor on the decoder's last layer at the start.
-        normalizer_decay: decay of the exponentially weighted statistics (``paper`` features).
+        output_init: factor on the decoder's last layer at the start; None: 1.
+        normalizer_decay: decay of the exponentially weighted statistics (``paper`` features); 0: plain sums over all rows.
         body_velocity: displacement of the body that its nodes see: from the ``previous`` frame or to the ``next``
             (``paper`` features).
         embedded_levels: levels that the level feature tells apart, the mesh included; None: those the schedule works on.
@@ -369,6 +369,7 @@ def build_simulator(
     Raises:
         ValueError: values that do not fit together, or a name that nothing has; names the key.
     """
+    output_init = 1.0 if output_init is None else output_init
     config = {name: value for name, value in locals().items() if name not in _CONVENTIONS or value != _CONVENTIONS[name]}
     for name in ("latent_dim", "body_radius", "output_scale", "late_scale", "layer_radius", "coarse_edge"):
         if name in config and not (isinstance(config[name], (int, float)) and config[name] > 0):

@@ -95,6 +95,19 @@ class FrameRules:
             return displacement / dt**2
         return (displacement + (self.frame_dt - dt) * problem.state.vel) / dt**2
 
+    def judged(self, problem: StepProblem) -> StepProblem:
+        """The step as energies see it: x_t − x_{t−1}, of which the network is told in frames, is dt v in a step of any dt.
+
+        The problem itself for models whose steps last their dt, and for steps that begin at rest or last a frame.
+        """
+        state = problem.state
+        if self.frame_dt is None or not bool(state.vel.any()):
+            return problem
+        frames = torch.full_like(problem.vertex_dt, self.frame_dt) / problem.vertex_dt
+        if bool((frames == 1.0).all()):
+            return problem
+        return replace(problem, state=State(state.pos, state.vel * frames, state.origin))
+
     def next_velocity(self, problem: StepProblem, acc: Tensor) -> Tensor:
         """(V, 3) m/s at t + 1 of a step with acceleration ``acc``: (x_{t+1} − x_t) over the duration of the step; 0 after a
         relaxing step from which the model restarts."""

@@ -16,11 +16,15 @@ class Horizon:
     """Predicted steps per training rollout: ``start`` at first, one more every ``every`` iterations, at most ``maximum``.
 
     The paper (section 3.4): every 5000 iterations, at most 5.
+
+    ``with_relaxing``: the relaxing step, with which every rollout begins, is one of them, as in the released code; otherwise it
+    comes before them. Where ``every`` counts rollouts, :meth:`rollout` says which one an update belongs to.
     """
 
     every: int = 5000
     maximum: int = 5
     start: int = 1
+    with_relaxing: bool = False
 
     def __post_init__(self) -> None:
         _require_least("horizon", self, every=0, maximum=1, start=1)
@@ -29,6 +33,29 @@ class Horizon:
 
     def __call__(self, iteration: int) -> int:
         return min(self.start + iteration // max(self.every, 1), self.maximum)
+
+    def after_relaxing(self, iteration: int) -> int:
+        """Steps of a rollout that follow the relaxing one."""
+        return self(iteration) - self.with_relaxing
+
+    def rollout(self, update: int) -> int:
+        """Number of the rollout that an update belongs to, from 0, where every rollout is as long as the ``horizon`` of its
+        number says and has one update a step."""
+        done, left = 0, update
+        for _ in range(self.start, self.maximum):
+            steps = self.after_relaxing(done) + 1
+            if left < max(self.every, 1) * steps:
+                break
+            done, left = done + max(self.every, 1), left - max(self.every, 1) * steps
+        return done + left // (self.after_relaxing(done) + 1)
+
+    def updates(self, rollouts: int) -> int:
+        """Updates of the first ``rollouts`` of these rollouts."""
+        made, done = 0, 0
+        for _ in range(self.start, self.maximum):
+            several = min(max(self.every, 1), rollouts - done)
+            made, done = made + several * (self.after_relaxing(done) + 1), done + several
+        return made + (rollouts - done) * (self.after_relaxing(done) + 1)
 
     def scaled(self, factor: float) -> Horizon:
         """The same curriculum, ``factor`` times as long."""

@@ -31,6 +31,8 @@ _BAD_START = 0.25
 MAX_DRAWS = 4
 #: Workers of one process, unless told otherwise: more than these make no rollout of 1k vertices start sooner.
 _MAX_WORKERS = 4
+#: Tells the generator of a scene's noise from that of the scene.
+_NOISE = 1
 #: Scenes a run takes before it starts workers: one of a few updates would be over before they are ready.
 _WARM_UP = 16
 
@@ -48,7 +50,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Start:
-    """A scene and the state before its relaxing step, on the CPU."""
+    """A scene and the state before its first step, on the CPU; its velocity is the way of the frame before."""
 
     window: Window
     state: State
@@ -61,14 +63,25 @@ def draw_window(sampler: SceneSampler, seed: int, slot: int, draw: int, garment:
 
 
 def make_start(sampler: SceneSampler, request: Request) -> Start:
-    """The scene that was asked for; the last attempt is taken as it is."""
+    """The scene that was asked for; the last attempt is taken as it is, and so is the first where starts are not settled."""
     for attempt, garment in enumerate(request.garments):
         window = draw_window(sampler, request.seed, request.slot, request.draw + attempt, garment, request.num_steps)
-        state = window.scene.start(window.start_frame, relaxed=False)
+        state = window.scene.start(window.start_frame, relaxed=False, by_centroids=sampler.by_centroids)
         strain = edge_strain(window.scene.cloth, state.pos).abs()
-        if float((strain > _BAD_START).double().mean()) < 0.02:
+        if sampler.by_centroids or float((strain > _BAD_START).double().mean()) < 0.02:
             break
-    return Start(window, state, attempt + 1)
+    shaking = np.random.default_rng([request.seed, request.slot, request.draw + attempt, _NOISE])
+    return Start(window, _shaken(sampler, window, state, shaking), attempt + 1)
+
+
+def _shaken(sampler: SceneSampler, window: Window, state: State, rng: np.random.Generator) -> State:
+    """``state`` with the sampler's noise: on x_t in its positions, and that of both times in its velocity, the way from x_{t−1}
+    over the dt of a regular step."""
+    if sampler.noise == 0:
+        return state
+    now, before = torch.as_tensor(sampler.noise * rng.normal(size=(2, *state.pos.shape))).to(state.pos)
+    shaking = sampler.noise_on_pinned | ~window.scene.cloth.pinned[:, None]
+    return State(state.pos + now * shaking, state.vel + (now - before) * shaking / window.scene.dt, state.origin)
 
 
 class SceneFeed:

@@ -16,7 +16,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.binding import bind_garment, hold_on_trunk
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.mirror import mirror_body, mirror_garment
-from hood.assets.material import Material, sample_material
+from hood.assets.material import RANGES, Material, sample_material
 from hood.assets.motion.motion_files import MotionFiles, motion_lengths
 from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.cloth.cloth import Cloth
@@ -29,6 +29,8 @@ from hood.tensors.batch import to_device
 _MAX_UNREADABLE = 100
 #: Shape coefficients beyond are no body's: the models' axes are standard deviations.
 _MOST_BETA = 10.0
+#: Noise [m] beyond tears every garment.
+_MOST_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Window:
     start_frame: int
     template: int = 0  # index into the sampler's garments
     mirrored: bool = False
+    still: bool = False  # a rollout of one step holds the body still for a regular dt, and is no relaxing step
 
     def to(self, device: torch.device | str) -> Window:
         """The same with the scene's tensors on ``device``."""
@@ -64,6 +67,11 @@ class SceneSampler:
         mirror: show every other scene, at random, as its image x → −x, so that no side is special: without it, what a
             network learns from lopsided motions lets cloth drift sideways on a body that stands still.
         material: fabric of every scene; None: drawn (:func:`hood.assets.material.sample_material`).
+        uniform: properties of the fabric that are drawn uniformly; the others are log-uniform.
+        still_fraction: share of the rollouts of one step whose step is a regular one with a still body, not the relaxing one.
+        by_centroids: scenes begin as by :func:`hood.scene.start.leave_by_centroids`, not settled.
+        noise: standard deviation [m] of normal noise on every coordinate of x_t and of x_{t−1} at the start, independent.
+        noise_on_pinned: pinned vertices have it as well.
         device: where the scenes' tensors live in training.
 
     Raises:
@@ -82,10 +90,19 @@ class SceneSampler:
         mirror: bool = True,
         material: Material | None = None,
         device: str = "cpu",
+        uniform: Sequence[str] = (),
+        still_fraction: float = 0.0,
+        by_centroids: bool = False,
+        noise: float = 0.0,
+        noise_on_pinned: bool = False,
     ) -> None:
         if not garments or not sequences:
             raise ValueError("training needs at least one garment and one motion (data.garments, data.sequences)")
-        _check_ranges(beta_range, size_range, piecewise_fraction)
+        _check_ranges(beta_range, size_range)
+        if not 0 <= noise <= _MOST_NOISE:
+            raise ValueError(f"data.sampling.noise is {noise}; give metres, 0 to {_MOST_NOISE:g}, such as 3.0e-3")
+        _check_shares(piecewise_fraction=piecewise_fraction, still_fraction=still_fraction)
+        _check_properties(uniform)
         self.body = body
         self.garments = [hold_on_trunk(bind_garment(garment, body), body) for garment in garments]
         self.sequences = sequences if isinstance(sequences, MotionFiles) else list(sequences)
@@ -95,6 +112,10 @@ class SceneSampler:
         self.piecewise_fraction = piecewise_fraction
         self.random_yaw, self.mirror = random_yaw, mirror
         self.material = material
+        self.uniform = tuple(uniform)
+        self.still_fraction = still_fraction
+        self.by_centroids = by_centroids
+        self.noise, self.noise_on_pinned = noise, noise_on_pinned
         self.device = device
 
     def sample(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Window:
@@ -113,11 +134,12 @@ class SceneSampler:
             window = turn_world(window, turn)
         betas = np.asarray(rng.uniform(-self.beta_range, self.beta_range, self.body.shapedirs.shape[2]))
         size = float(rng.uniform(self.size_low, self.size_high))
-        material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction)
+        material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction, uniform=self.uniform)
         mirrored = self.mirror and rng.random() < 0.5
         body, worn = self._assets(index, mirrored)
         scene = dress(worn, body_motion(body, window, betas), material, size)
-        return Window(scene, min(start, 1), index, mirrored)
+        still = self.still_fraction > 0 and rng.random() < self.still_fraction
+        return Window(scene, min(start, 1), index, mirrored, still)
 
     def pack(self, window: Window) -> dict[str, Any]:
         """A sampled window as plain arrays, without the body and the garment that every process has; surfaces posed."""
@@ -131,6 +153,7 @@ class SceneSampler:
             "start_frame": window.start_frame,
             "template": window.template,
             "mirrored": window.mirrored,
+            "still": window.still,
         }
 
     def unpack(self, packed: dict[str, Any]) -> Window:
@@ -144,7 +167,7 @@ class SceneSampler:
         surfaces = {chunk: torch.from_numpy(surface) for chunk, surface in packed["surfaces"].items()}
         posed, fastening = motion.with_surfaces(surfaces, "cpu"), fastening_of(garment.fasteners, cloth.rest_pos)
         scene = Scene(cloth, garment, posed, 1.0 / packed["sequence"].fps, fastening=fastening)
-        return Window(scene, packed["start_frame"], packed["template"], packed["mirrored"])
+        return Window(scene, *(packed[name] for name in ("start_frame", "template", "mirrored", "still")))
 
     def _draw_motion(self, rng: np.random.Generator, num_steps: int) -> tuple[PoseSequence, int]:
         """Part of a motion with ``num_steps`` steps ahead of a start frame, and that frame in the whole motion."""
@@ -184,7 +207,7 @@ def _to_numpy(value: Any) -> Any:
     return value.numpy() if isinstance(value, Tensor) else value
 
 
-def _check_ranges(beta_range: float, size_range: Sequence[float], piecewise_fraction: float) -> None:
+def _check_ranges(beta_range: float, size_range: Sequence[float]) -> None:
     """Raise ValueError for ranges that nothing can be drawn from; names the key."""
     if not 0 <= beta_range <= _MOST_BETA:
         raise ValueError(f"data.sampling.beta_range is {beta_range}; give 0 (the mean body) to {_MOST_BETA:g}, such as 2.0")
@@ -193,5 +216,15 @@ def _check_ranges(beta_range: float, size_range: Sequence[float], piecewise_frac
         raise ValueError(
             f"data.sampling.size_range is {list(size_range)}; give the least and the largest factor, above 0, such as [0.9,1.1]"
         )
-    if not 0 <= piecewise_fraction <= 1:
-        raise ValueError(f"data.sampling.piecewise_fraction is {piecewise_fraction}; give a share of the scenes, 0 to 1")
+
+
+def _check_shares(**shares: float) -> None:
+    for name, share in shares.items():
+        if not 0 <= share <= 1:
+            raise ValueError(f"data.sampling.{name} is {share}; give a share of the scenes, 0 to 1")
+
+
+def _check_properties(uniform: Sequence[str]) -> None:
+    strange = next((name for name in uniform if name not in RANGES), None)
+    if strange is not None or isinstance(uniform, str):
+        raise ValueError(f"data.sampling.uniform is {uniform!r}; give a list of {', '.join(RANGES)}")

@@ -17,6 +17,7 @@ from hood.model.network.kernel_choice import AUTO
 from hood.model.network.model import PRECISIONS
 from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
+from hood.training.slots import RELAXED_VELOCITIES
 
 #: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
 _QUINTIC = (3.4445, -4.7750, 2.0315)
@@ -117,6 +118,9 @@ class TrainerSettings:
     1 + rg / 3, so that one broken scene does not drown the others.
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
+    ``by_rollout``: ``horizon`` and ``collision`` count training rollouts, what the released code calls iterations, see
+    :meth:`count`; a rollout then has all steps of the horizon with which it began, torn or not.
+    ``relaxed_velocity``: with which a rollout goes on from the relaxing step, see :class:`hood.training.slots.Slots`.
     ``keep_at``: iterations whose weights and checkpoint stay, in the folder ``kept`` of the run; not
     of one whose own update was skipped.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
@@ -133,6 +137,8 @@ class TrainerSettings:
     schedule: StepDecay | WarmupCosine | InverseRoot = field(default_factory=StepDecay)
     horizon: Horizon = field(default_factory=Horizon)
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
+    by_rollout: bool = False
+    relaxed_velocity: str = "skinned"
     clip_norm: float = 1.0
     signal: str = "potential"
     optimizer: str = "adam"
@@ -160,6 +166,9 @@ class TrainerSettings:
             raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
         if self.signal not in ("potential", "scaled"):
             raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
+        if self.relaxed_velocity not in RELAXED_VELOCITIES:
+            names = " or ".join(map(repr, RELAXED_VELOCITIES))
+            raise ValueError(f"trainer.relaxed_velocity {self.relaxed_velocity!r}: give {names}")
         for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
             if getattr(self, name) < 1:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")
@@ -176,6 +185,13 @@ class TrainerSettings:
             raise ValueError(f"trainer.ema_decay is {self.ema_decay}; it must be at least 0 and below 1")
         if self.time_scale != 1.0:
             self.compressed()  # refused here rather than after the data has been read
+
+    def count(self, iteration: int) -> int:
+        """What ``horizon`` and ``collision`` count, at an iteration: iterations, or with ``by_rollout`` rollouts.
+
+        One that breaks off at what is no number is counted with all its steps: schedules are functions of the iteration.
+        """
+        return self.horizon.rollout(iteration) if self.by_rollout else iteration
 
     def compressed(self) -> TrainerSettings:
         """The same with ``time_scale`` 1 and everything that is counted from the start of the schedule multiplied by it:

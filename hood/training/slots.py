@@ -6,7 +6,7 @@ Garments by size: a batch holds scenes of similar size, and as many of them as a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth, concatenate_cloths
 from hood.cloth.state import State, StepInput, concatenate_states, concatenate_step_inputs
-from hood.scene.scene import recentre
+from hood.scene.scene import RELAXING_DT, recentre
 from hood.solver.step_figures import edge_strain
 from hood.steppers.network import NetworkStepper, Prepared
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
@@ -78,6 +78,8 @@ def next_bucket(buckets: Sequence[Bucket], turns: Sequence[int]) -> int:
     return min(range(len(buckets)), key=lambda k: ((turns[k] + 1) / len(buckets[k].templates), k))
 
 
+#: Velocities after the relaxing step.
+RELAXED_VELOCITIES = ("skinned", "own", "zero")
 #: A training rollout is given up once 1% of its edges are strained beyond this: nothing can be learned from debris.
 _BROKEN_STRAIN = 1.5
 
@@ -88,6 +90,8 @@ class _Slot:
     place: int  # in its bucket
     draws: int = 0
     age: int = 0
+    length: int | None = None  # steps after the relaxing one; None: as many as the horizon of the moment
+    still: bool = False  # there is no relaxing step: the first one is a regular one on a still body
     window: Window | None = None
     state: State | None = None
     prepared: Prepared | None = None
@@ -106,6 +110,10 @@ class Slots:
         max_horizon: regular steps of the longest rollout.
         max_vertices: vertices of one update at most, over all processes; None: garments of all sizes share batches.
         workers: processes that make scenes ahead, see :class:`hood.training.prefetch.SceneFeed`; None: one per idle core.
+        whole: rollouts keep the horizon with which they began and go on to it, torn or not; otherwise one that grows lengthens
+            those that run, and torn ones end.
+        relaxed_velocity: after the relaxing step: ``skinned``, that of the skinned garment; ``own``, its displacement in a
+            frame; ``zero``.
     """
 
     def __init__(
@@ -119,7 +127,10 @@ class Slots:
         ranks: int = 1,
         max_vertices: int | None = None,
         workers: int | None = 0,
+        whole: bool = False,
+        relaxed_velocity: str = "skinned",
     ) -> None:
+        self.whole, self.relaxed_velocity = whole, relaxed_velocity
         self.sampler, self.simulator, self.seed, self.max_horizon = sampler, simulator, seed, max_horizon
         self.buckets = make_buckets([len(garment.rest_pos) for garment in sampler.garments], batch_size, max_vertices)
         self._slots = {
@@ -137,21 +148,24 @@ class Slots:
         return self.buckets[-1].first + self.buckets[-1].count
 
     def batch(self, horizon: int) -> tuple[Cloth, Prepared, State, StepInput]:
-        """The current problems as one flat batch; slots past ``horizon`` steps start a new scene first."""
+        """The current problems as one flat batch; slots past ``horizon`` steps after the relaxing one start a scene first."""
         number, slots = self._current()
         for index, slot in slots.items():
             # Step 0 is the relaxing step; ``horizon`` regular steps follow it.
-            if slot.window is None or slot.age > horizon:
-                self._reset(index, slot)
+            if slot.window is None or slot.age > (horizon if slot.length is None else slot.length):
+                self._reset(index, slot, horizon)
         states, steps, counts = [], [], []
         for slot in slots.values():
             assert slot.window is not None
             assert slot.state is not None
-            scene, relaxing = slot.window.scene, slot.age == 0
+            scene, first = slot.window.scene, slot.age == 0
             slot.state = recentre(slot.state, scene.cloth.vertex_scene)
             frame = slot.window.start_frame + max(slot.age - 1, 0)
             states.append(slot.state)
-            steps.append(scene.step_input(frame, slot.state, relaxing=relaxing))
+            step = scene.step_input(frame, slot.state, relaxing=first)
+            if first and slot.still:
+                step = replace(step, dt=torch.full_like(step.dt, scene.dt))
+            steps.append(step)
             counts.append(scene.cloth.num_vertices)
         if number not in self._batches:
             cloth = concatenate_cloths([slot.window.scene.cloth for slot in slots.values()])  # type: ignore[union-attr]
@@ -182,10 +196,10 @@ class Slots:
             offset = rows.stop
             pos, vel = next_pos[rows].detach(), next_vel[rows].detach()
             if slot.age == 0:
-                vel = scene.start_velocity(slot.window.start_frame)
+                vel = self._relaxed(slot, vel)
             slot.state = State(pos, vel, slot.state.origin)
             slot.age += 1
-            if _broken(scene.cloth, pos):
+            if not bool(torch.isfinite(pos).all()) or not self.whole and _is_debris(scene.cloth, pos):
                 slot.window = None
         self._turns[number] += 1
 
@@ -195,6 +209,8 @@ class Slots:
         for index, slot in self._slots.items():
             entry: dict[str, Any] = {"draws": slot.draws, "age": slot.age, "live": slot.window is not None}
             entry["turns"] = self._turns[slot.bucket]
+            if slot.length is not None:
+                entry["length"] = slot.length
             if slot.state is not None and slot.window is not None:
                 entry |= {"pos": slot.state.pos, "vel": slot.state.vel, "origin": slot.state.origin}
             entries[index] = entry
@@ -212,6 +228,7 @@ class Slots:
             entry = state[index]
             slot.draws, slot.age = int(entry["draws"]), int(entry["age"])
             self._turns[slot.bucket] = int(entry["turns"])
+            slot.length = entry.get("length")
             if entry["live"]:
                 draw, device = slot.draws - 1, self.sampler.device
                 garment = self.buckets[slot.bucket].template(slot.place, draw)
@@ -230,11 +247,14 @@ class Slots:
         number = next_bucket(self.buckets, self._turns)
         return number, {index: slot for index, slot in self._slots.items() if slot.bucket == number}
 
-    def _reset(self, index: int, slot: _Slot) -> None:
+    def _reset(self, index: int, slot: _Slot, horizon: int) -> None:
         start = self.feed.take(self._request(index, slot))
         device = self.sampler.device
         slot.window = start.window.to(device)
-        slot.state = State(start.state.pos.to(device), start.state.vel.to(device), start.state.origin)
+        slot.length, slot.still = horizon if self.whole else None, slot.window.still and horizon == 0
+        # The way of the frame before, as a velocity in the time of the first step.
+        vel = start.state.vel if self._in_frames(slot) else start.state.vel * (slot.window.scene.dt / RELAXING_DT)
+        slot.state = State(start.state.pos.to(device), vel.to(device), start.state.origin)
         slot.draws += start.draws
         slot.prepared = self._prepare(slot.window)
         slot.age = 0
@@ -252,13 +272,25 @@ class Slots:
         garments = tuple(bucket.template(slot.place, slot.draws + attempt) for attempt in range(MAX_DRAWS))
         return Request(self.seed, index, slot.draws, garments, self.max_horizon + 1)
 
+    def _in_frames(self, slot: _Slot) -> bool:
+        """Whether velocities of the first step are those of a frame."""
+        return self.simulator.rules.frame_dt is not None or slot.still
+
+    def _relaxed(self, slot: _Slot, vel: Tensor) -> Tensor:
+        """Velocity (V, 3) [m/s] after the first step, of which the simulator says ``vel``."""
+        window = slot.window
+        assert window is not None
+        if self.relaxed_velocity == "skinned":
+            return window.scene.start_velocity(window.start_frame)
+        if self.relaxed_velocity == "zero":
+            return torch.zeros_like(vel)
+        return vel if self._in_frames(slot) else vel * (RELAXING_DT / window.scene.dt)
+
     def _prepare(self, window: Window) -> Prepared:
         # A mirrored scene has the levels of its template: they are then the image of the original's, and found once.
         return self.simulator.prepare(window.scene.cloth, self.sampler.garments[window.template].rest_pos)
 
 
-def _broken(cloth: Cloth, pos: Tensor) -> bool:
-    if not bool(torch.isfinite(pos).all()):
-        return True
+def _is_debris(cloth: Cloth, pos: Tensor) -> bool:
     strain = edge_strain(cloth, pos).abs()
     return float((strain > _BROKEN_STRAIN).double().mean()) > 0.01

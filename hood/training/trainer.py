@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,8 @@ class Trainer:
         settings.collision.require_its_weight(potential)
         shown = for_networks(potential)
         simulator.use_potential(shown)
-        simulator.trained_for = training_conditions(sampler, settings.collision.apply(shown, settings.iterations))
+        last = settings.collision.apply(shown, settings.count(settings.iterations))
+        simulator.trained_for = training_conditions(sampler, last)
         self.simulator, self.potential, self.settings = simulator, potential, settings
         self.folder, self.seed, self.watch = folder, seed, watch
         simulator.network.use_precision(settings.precision)
@@ -86,8 +88,9 @@ class Trainer:
         ranks, rank = distributed.world_size(), distributed.rank()
         if settings.batch_size % ranks:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
-        shares = (rank, ranks, settings.max_vertices, settings.workers)
-        self.slots = Slots(sampler, simulator, settings.batch_size, seed, settings.horizon.maximum, *shares)
+        longest = settings.horizon.maximum - settings.horizon.with_relaxing
+        shares = (rank, ranks, settings.max_vertices, settings.workers, settings.by_rollout, settings.relaxed_velocity)
+        self.slots = Slots(sampler, simulator, settings.batch_size, seed, longest, *shares)
         self.model: torch.nn.Module = simulator
         if ranks > 1:
             # Statistics are kept equal by their own sums; scenes are drawn by slot, so only other draws need a generator each.
@@ -181,20 +184,24 @@ class Trainer:
         """One step of every slot and one optimiser update; returns what was measured."""
         settings, simulator = self.settings, self.simulator
         simulator.train()
-        horizon, clock = settings.horizon(self.iteration), self.stopwatch
+        count, clock = settings.count(self.iteration), self.stopwatch
         with timed(clock, "scenes"):
-            cloth, prepared, state, step = self.slots.batch(horizon)
-        potential = settings.collision.apply(self.potential, self.iteration)
+            cloth, prepared, state, step = self.slots.batch(settings.horizon.after_relaxing(count))
+        potential = settings.collision.apply(self.potential, count)
         simulator.use_potential(for_networks(potential))
         with timed(clock, "search"):
-            problem = potential.prepare(StepProblem(cloth, state, step, gravity=simulator.gravity))
+            asked = StepProblem(cloth, state, step, gravity=simulator.gravity)
+            problem = potential.prepare(simulator.rules.judged(asked))
+        shown = problem if problem.state is state else replace(problem, state=state)
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and simulator.output.collects_statistics:
             simulator.output.observe(self.slots.skinned_accelerations())
         with torch.set_grad_enabled(not collecting):
-            prediction = (simulator if collecting else self.model)(problem, prepared, clock)
+            prediction = (simulator if collecting else self.model)(shown, prepared, clock)
+        next_pos = prediction.next_pos.detach()
+        acc = prediction.acc.detach() if shown is problem else problem.acceleration(next_pos)
         with timed(clock, "losses"):
-            gradient, energies = potential.gradient(problem, prediction.next_pos.detach(), prediction.acc.detach())
+            gradient, energies = potential.gradient(problem, next_pos, acc)
             gradient = gradient * cloth.free.unsqueeze(1)
             residual = relative_gradient(problem, gradient)
         if self.observe is not None:
@@ -202,9 +209,9 @@ class Trainer:
         report = {name: float(value.mean()) for name, value in energies.items()}
         report |= {
             "total": sum(report.values()),
-            "loss": float((relative_loss(problem, energies, prediction.acc.detach()) * self._damping(residual)).mean()),
+            "loss": float((relative_loss(problem, energies, acc) * self._damping(residual)).mean()),
             "relative_gradient": float(residual.median()),
-            "horizon": float(horizon),
+            "horizon": float(settings.horizon(count)),
         }
         if not collecting:
             weight = self._weight(problem, residual)
@@ -218,7 +225,7 @@ class Trainer:
                 surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
             report |= self._optimise(surrogate, {name: report[name] for name in energies})
         with timed(clock, "scenes"):
-            self.slots.advance(prediction.next_pos, simulator.next_velocity(problem, prediction))
+            self.slots.advance(prediction.next_pos, simulator.next_velocity(shown, prediction))
         self.iteration += 1
         return report
 

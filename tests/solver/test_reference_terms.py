@@ -13,6 +13,7 @@ from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State
 from hood.contact.contact import CentroidContact, find_contact
 from hood.energies.bending import CurrentLengthBending
+from hood.energies.membrane import CodedStretching
 from hood.energies.potential import Potential, coded_potential, default_potential, reference_potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.step_terms import StepTerms
@@ -30,6 +31,7 @@ POTENTIALS = {
     "as meant": reference_potential(),
     "as coded": coded_potential(),
     "as coded, cvpr": coded_potential(collision_lagged=True),
+    "as meant, the membrane as coded": reference_potential().with_terms(stretching=CodedStretching()),
 }
 
 

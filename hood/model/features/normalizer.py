@@ -13,7 +13,8 @@ class RunningNormalizer(nn.Module):
 
     Every call in training mode is one update with the moments of its rows: with decay γ, call t of T has the weight
     γ^(T − t), divided by the sum of all weights (bias correction), so the first calls are not pulled towards zero.
-    γ = 1 keeps the plain mean over calls. Sums are kept in float64 and travel in the state dict. Nothing accumulates in
+    γ = 1 keeps the plain mean over calls, γ = 0 that over all rows of all calls, as the released code does. Sums are kept in
+    float64 and travel in the state dict. Nothing accumulates in
     evaluation mode, after :meth:`freeze` or for calls without rows.
 
     Where several processes share a batch, ``shared_sum`` adds up their moments: all of them then hold the statistics of the
@@ -25,7 +26,7 @@ class RunningNormalizer(nn.Module):
 
     Args:
         width: number of channels.
-        decay: γ; 0.999 averages over about the last 1000 calls.
+        decay: γ; 0.999 averages over about the last 1000 calls; 0: plain sums over rows, nothing is forgotten.
         floor: smallest deviation that counts as variation, also relative to the mean at 1e-6.
         min_updates: calls before the statistics are used.
         divisor_floor: least divisor; None centres constant channels only.
@@ -41,8 +42,8 @@ class RunningNormalizer(nn.Module):
         self, width: int, decay: float = 0.999, floor: float = 1e-8, min_updates: int = 1, divisor_floor: float | None = None
     ) -> None:
         super().__init__()
-        if not 0 < decay <= 1:
-            raise ValueError(f"normaliser: decay is {decay}; it must lie in (0, 1]")
+        if not 0 <= decay <= 1:
+            raise ValueError(f"normaliser: decay is {decay}; it must lie in [0, 1] (0: plain sums over all rows)")
         if divisor_floor is not None and not divisor_floor > 0:
             raise ValueError(f"normaliser: divisor_floor is {divisor_floor}; it must be > 0")
         self.width, self.decay, self.floor, self.min_updates = width, decay, floor, min_updates
@@ -86,12 +87,18 @@ class RunningNormalizer(nn.Module):
             count = int(moments[0])
         if count == 0:
             return
+        self.num_updates += 1
+        if self.decay == 0:
+            for total, part in zip(
+                (self.weight, self.first, self.second), moments.split([1, self.width, self.width]), strict=True
+            ):
+                total.add_(part.view_as(total))
+            return
         fresh = 1.0 - self.decay if self.decay < 1 else 1.0
         self.weight.mul_(self.decay).add_(fresh)
         first, second = (moments[1:] / moments[0]).split(self.width)
         self.first.mul_(self.decay).add_(first, alpha=fresh)
         self.second.mul_(self.decay).add_(second, alpha=fresh)
-        self.num_updates += 1
 
     def statistics(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation in use, each (width,)."""

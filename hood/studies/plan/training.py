@@ -68,7 +68,8 @@ def plan_training(config: DictConfig, words: Sequence[str], updates: int, scenes
     shares = _Shares()
     times = _timed(trainer, shares, updates)
     drawn = _draw(trainer, scenes)
-    steps = float(np.mean([settings.horizon(index) + 1 for index in range(settings.iterations)]))
+    counts = (settings.count(index) for index in range(settings.iterations))
+    steps = float(np.mean([settings.horizon.after_relaxing(count) + 1 for count in counts]))
     scene_ms = drawn.pop("ms_per_scene")
     times["scenes"] += scene_ms * trainer.slots.num_slots / len(trainer.slots.buckets) / steps
     total = sum(times.values())

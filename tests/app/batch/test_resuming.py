@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from omegaconf import open_dict
+from omegaconf import OmegaConf, open_dict
 
 from hood.app.common import require_same_config
 from hood.app.settings.compose import ConfigError, load_config
@@ -44,6 +44,35 @@ def test_a_run_that_was_begun_before_a_key_was_there_goes_on(tmp_path: Path) -> 
     require_same_config(load_config("train", TINY), tmp_path, ())
     with pytest.raises(ConfigError, match=r"data\.trans_unit is null there, cm in this command"):
         require_same_config(load_config("train", [*TINY, "data.trans_unit=cm"]), tmp_path, ())
+
+
+#: Keys of trainings that runs of before them do not have.
+LATER = {
+    "model": ("output_init", "normalizer_decay"),
+    "trainer": ("by_rollout", "relaxed_velocity"),
+    "trainer.horizon": ("with_relaxing",),
+    "data.sampling": ("uniform", "by_centroids", "noise", "noise_on_pinned", "still_fraction"),
+}
+
+
+def test_a_training_of_before_the_released_recipe_goes_on(tmp_path: Path) -> None:
+    words = ["experiment=paper", "data.garments=[tank]"]
+    earlier = load_config("train", words)
+    with open_dict(earlier):
+        for group, keys in LATER.items():
+            for key in keys:
+                OmegaConf.select(earlier, group).pop(key)
+    save_run_record(tmp_path, earlier, 0)
+    require_same_config(load_config("train", words), tmp_path, ())
+    for given, said in (
+        ("trainer.by_rollout=true", r"trainer\.by_rollout is null there, true in this command"),
+        ("trainer.relaxed_velocity=own", r"trainer\.relaxed_velocity is null there, own in this command"),
+        ("trainer.horizon.with_relaxing=true", r"trainer\.horizon\.with_relaxing is null there"),
+        ("data.sampling.noise=3e-3", r"data\.sampling\.noise is null there, 0\.003 in this command"),
+        ("model.normalizer_decay=0", r"model\.normalizer_decay is null there"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            require_same_config(load_config("train", [*words, given]), tmp_path, ())
 
 
 def test_a_training_that_has_nothing_to_resume_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

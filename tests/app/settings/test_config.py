@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from hood.app.settings import compose
@@ -108,6 +109,15 @@ def test_training_config_builds_what_it_says() -> None:
     assert isinstance(settings, TrainerSettings)
     assert settings.schedule == WarmupCosine(7, config.trainer.schedule.floor)
     assert isinstance(build(config.model), NetworkStepper)
+
+
+def test_the_papers_models_may_begin_with_small_predictions() -> None:
+    last = {}
+    for word in ("null", "0.01"):
+        torch.manual_seed(0)
+        model = build(load_config("train", ["model=ours", "model.latent_dim=8", f"model.output_init={word}"]).model)
+        last[word] = model.network.decoder.third.weight
+    torch.testing.assert_close(last["0.01"], 0.01 * last["null"])
 
 
 def test_default_losses_are_the_librarys(rollout_losses: Potential) -> None:

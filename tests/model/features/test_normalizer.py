@@ -24,6 +24,18 @@ def test_statistics_are_the_exponentially_weighted_moments(decay):
     torch.testing.assert_close(normalizer.eval()(data[0]), expected.float())
 
 
+def test_plain_sums_weigh_every_row_alike():
+    normalizer, data = RunningNormalizer(4, 0.0), calls()
+    for x in data:
+        normalizer(x)
+    rows = torch.cat(data).double()
+    mean, std = normalizer.statistics(torch.float64)
+    torch.testing.assert_close(mean, rows.mean(0))
+    torch.testing.assert_close(std, rows.std(0, correction=0))
+    assert float(normalizer.weight) == len(rows)
+    assert int(normalizer.num_updates) == len(data)
+
+
 def test_first_call_is_standardised_by_itself():
     x = calls(1)[0]
     y = RunningNormalizer(4)(x)
