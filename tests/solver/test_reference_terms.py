@@ -13,8 +13,16 @@ from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State
 from hood.contact.contact import CentroidContact, find_contact
 from hood.energies.bending import CurrentLengthBending
+from hood.energies.friction import CodedFriction
 from hood.energies.membrane import CodedStretching
-from hood.energies.potential import Potential, coded_potential, default_potential, reference_potential, relative_gradient
+from hood.energies.potential import (
+    Potential,
+    coded_potential,
+    default_potential,
+    reference_potential,
+    relative_gradient,
+    scale,
+)
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.derivatives.vertices import terms_without_form
@@ -116,10 +124,15 @@ def test_a_sheet_on_a_sphere_converges(dtype: torch.dtype, linear_solver: str, f
     problem, potential = sheet_on_sphere(dtype), POTENTIALS[form]
     settings = NewtonSettings(target_rg=1e-3, max_iterations=30, linear=linear_solver)
     pos, report = minimize(potential, problem, settings=settings)
-    assert bool(report.converged.all()), report.reason
     prepared = potential.prepare(in_double(problem))
     gradient, energies = potential.gradient(prepared, pos.double(), report.acc.double())
-    assert float(relative_gradient(prepared, gradient)) <= 2e-3
+    if isinstance(potential.terms["friction"], CodedFriction):  # has kinks, and minima on them: no gradient vanishes there
+        longer = minimize(potential, problem, settings=replace(settings, max_iterations=200))[1]
+        assert float(report.phi - longer.phi) <= 1e-4 * float(scale(prepared))
+        assert float(relative_gradient(prepared, gradient)) <= 0.02
+    else:
+        assert bool(report.converged.all()), report.reason
+        assert float(relative_gradient(prepared, gradient)) <= 2e-3
     assert float(energies["collision"]) > 0
     assert float(energies["friction"]) > 0
 
