@@ -33,7 +33,7 @@ _WIDTH = 160
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """The columns of the rows' files: the same ones for all rows, and one for every other energy that acts in some of them."""
-    counts = ("rollouts", "frames", "gap_states", "gap_spread", "L_states")
+    counts = ("rollouts", "frames", "gap_states", "gap_spread", "L_states", "network", "as_in_paper")
     return (*_NAMES, *_MAIN, *_GAP, *_TERMS, *_others(rows), *_STATE, *_SURFACE, *_FAILURE, *counts, *_ENDS)
 
 

@@ -291,11 +291,18 @@ def _tell(progress: _Progress, done: int, text: str) -> None:
     progress(text, done)
 
 
-def _reach(stepper: Stepper) -> dict[str, int | None]:
+def _reach(stepper: Stepper) -> dict[str, Any]:
+    """Steps, radius and kind of a network; ``as_in_paper`` says whether all but its schedule is that of the paper."""
     network = network_of(stepper)
     if network is None:
         return {"steps": None, "radius": None}
-    return {"steps": len(network.schedule), "radius": measured_radius(network)}
+    features, output, latent = (network.config.get(key) for key in ("features", "output", "latent_dim"))
+    return {
+        "steps": len(network.schedule),
+        "radius": measured_radius(network),
+        "network": f"latent {latent}, features {features}, output {output}",
+        "as_in_paper": (features, output, latent) == ("paper", "acceleration", 128),
+    }
 
 
 def _run(

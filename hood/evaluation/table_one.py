@@ -117,8 +117,15 @@ def _paper_column(garment: str) -> int:
 
 
 def _by_model(rows: Sequence[Row], garment: str) -> dict[str, Row]:
-    """Trained or not, the rows of models the paper has too."""
-    return {row["model"]: row for row in rows if row["garment"] == garment and row["model"] in PAPER}
+    """Trained or not, the rows of models the paper has too: by name, else the first network that is as in the paper."""
+    here = [row for row in rows if row["garment"] == garment]
+    named = {row["model"]: row for row in here if row["model"] in PAPER}
+    for row in here:
+        reach = (row.get("steps"), row.get("radius"))
+        title = next((name for name, one in PAPER.items() if (one.steps, one.radius) == reach), None)
+        if title is not None and row.get("as_in_paper") and not any(one is row for one in named.values()):
+            named.setdefault(title, row)
+    return {name: named[name] for name in PAPER if name in named}
 
 
 def _radius_check(rows: Sequence[Row]) -> Check:
@@ -184,6 +191,8 @@ def _cell(row: Row, key: str) -> str:
     text = _number(value)
     if key == "model" and row["weights"] == _UNTRAINED:
         text += " (untrained)"
+    if key == "model" and value in PAPER and row.get("as_in_paper") is False:
+        text += " (schedule alone)"
     low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
     return text if key not in INTERVALS or low is None else f"{text} ({_number(low)} to {_number(high)})"
 
@@ -201,7 +210,8 @@ def _legend() -> str:
         "of the same step, on states that the model reached itself; rg = ‖∇Φ‖ / ‖M g‖. L above the minimum is the same energy "
         "in joules, the median over those states, whose own L_total is in the second table. worn is the share of the frames "
         "before a part of the garment has come off the body: cloth that falls lowers L_total, by 2 J for 0.2 kg and a "
-        "metre, so compare it only between models that keep it on. L_total and gradient norm are means, "
+        "metre, so compare it only between models that keep it on. Of a model "
+        "marked (schedule alone) the network is another one than the paper's. L_total and gradient norm are means, "
         "ms, rg and strain p99 medians over frames. A rollout has failed at the first frame that is not finite or whose strain "
         f"p99 exceeds {FAILURE_STRAIN:.0%}; frames to failure is the median over rollouts (–: less than half failed). γ "
         "unconverged and γ disagree are the shares of the states whose reference minimum missed its accuracy, and of those "
@@ -244,10 +254,20 @@ def _differences(rows: Sequence[Row], about: TableConditions) -> str:
             f"- Body: {about.body} with contact against its triangles; the paper's is SMPL with contact against its vertices' "
             "faces by their centres. L_total contains gravity, whose zero is arbitrary: compare its differences, or γ.",
             f"- Hardware: {about.machine}; the paper's frame rates are those of a GPU. Only ratios can be compared.",
+            *_networks(rows),
             "- Budget: the paper's models saw 150,000 updates of one scene (about 26 hours on a GPU). "
             + ("; ".join(budgets) + "." if budgets else "No networks here."),
         )
     )
+
+
+def _networks(rows: Sequence[Row]) -> list[str]:
+    """A line on networks that are not the paper's in all."""
+    others = dict.fromkeys((row["model"], row["network"]) for row in rows if row.get("as_in_paper") is False)
+    if not others:
+        return []
+    told = "; ".join(f"{name}: {network}" for name, network in others)
+    return [f"- Networks: the paper's have latent 128, its features and accelerations as output. Here {told}."]
 
 
 def _budget(name: str, weights: str, about: TableConditions) -> str:

@@ -98,6 +98,17 @@ def test_the_dress_has_the_papers_first_figures() -> None:
     assert text.count("| **ours** | **dress** | **15** | **48** | **10** |") == 1
 
 
+def test_only_the_papers_networks_stand_for_it() -> None:
+    small = {"as_in_paper": False, "network": "latent 48, features local, output local_steps"}
+    papers = {"as_in_paper": True, "network": "latent 128, features paper, output acceleration"}
+    text = page([row("ours", **small), row("mine", **papers, steps=48, radius=48), row("newton")], ABOUT)
+    assert "| **ours (schedule alone)** | **all** |" in text
+    assert "| **mine** | **all** | **48** | **48** |" in text
+    assert "- Networks: the paper's have latent 128" in text
+    assert "Here ours: latent 48, features local, output local_steps." in text
+    assert "- Networks" not in page([row("ours", **papers)], ABOUT)
+
+
 def test_the_page_says_what_was_measured_and_how() -> None:
     rows = candidate_rows(solver(), {"dress": [rollout(1.0), rollout(3.0, 7)], "tank": [rollout(2.0)]})
     rows.append(row("ours", "dress"))
