@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import runpy
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,6 +46,9 @@ class Desk:
             (r"outputs/plan/plan\.json", self.plan),
             (r"([\w/]+/)?\w+\.safetensors", self.model),
             (r"postcvpr\.pth", self.published),
+            (r"SMPL_NEUTRAL\.pkl", self.smpl),
+            (r"garments_dict\.pkl", self.published_garments),
+            (r"vto/\w+\.csv", self.split),
             (r"(my_)?shirt\.obj|cape \(1\)\.obj|Röckchen\.obj", self.shirt),
             (r"shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
@@ -181,6 +186,30 @@ class Desk:
         """A body model of this layout."""
         return Path(self.workshop.body("smplx_npz"))
 
+    def smpl(self, name: str, words: Sequence[str]) -> Path:
+        """A body model as its authors give it."""
+        return Path(self.workshop.body("smpl_pickle"))
+
+    def published_garments(self, name: str, words: Sequence[str]) -> Path:
+        """Two garments in the layout of the published ones."""
+
+        def make(folder: Path) -> None:
+            garments = {garment: published_entry(load_garment(garment)) for garment in ("dress", "tshirt")}
+            (folder / name).write_bytes(pickle.dumps(garments, 2))
+
+        return self._once("published_garments", make) / name
+
+    def split(self, name: str, words: Sequence[str]) -> Path:
+        """A table of motions as the published one; the motion is laid beside it."""
+        file = Path(self.workshop.motion("amass_smplh"))
+
+        def make(folder: Path) -> None:
+            shutil.copy(file, folder / "01_01_poses.npz")
+            for part in ("train", "validation"):
+                (folder / f"{part}.csv").write_text("id,length,garment\n01_01_poses,30,dress\n", encoding="utf-8")
+
+        return self._once("vto", make)
+
     def piece(self, name: str, words: Sequence[str]) -> Path:
         def make(folder: Path) -> None:
             script = runpy.run_path(str(ROOT / "scripts" / "cut_pieces.py"))
@@ -203,6 +232,25 @@ class Desk:
 
     def page(self, name: str, words: Sequence[str]) -> Path:
         return self._once("page", lambda folder: _write_page(folder / "stability.md")) / "stability.md"
+
+
+def published_entry(garment: Garment) -> dict[str, Any]:
+    """A garment of ours as an entry of ``garments_dict.pkl``."""
+    count = len(garment.rest_pos)
+    return {
+        "rest_pos": garment.rest_pos.astype(np.float32),
+        "faces": garment.faces.astype(np.int32),
+        "node_type": np.where(garment.pinned, 3, 0)[:, None],
+        "lbs": {
+            "v": garment.tpose(np.zeros(10)).astype(np.float32),
+            "f": garment.faces,
+            "shapedirs": np.zeros((count, 3, 10)),
+            "posedirs": np.zeros((207, 3 * count)),
+            "lbs_weights": garment.lbs_weights,
+        },
+        "center": [0],
+        "coarse_edges": {},
+    }
 
 
 def _without_stars(name: str) -> str:
