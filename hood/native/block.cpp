@@ -69,10 +69,12 @@ class Behind {
     static constexpr int MOST = 4;  // arrays of a tile
     struct Span {
         const char* from;
-        char *to, *end;
+        char* to;
+        int64_t bytes;
     };
     Span spans[MOST];
     int count = 0, next = 0;
+    int64_t at = 0;  // of the next span
 
     static inline void half_a_line(const char* from, char* to) {
 #if defined(__AVX__)
@@ -83,14 +85,13 @@ class Behind {
     }
 
   public:
-    void add(const void* from, void* to, int64_t bytes) { spans[count++] = {(const char*)from, (char*)to, (char*)to + bytes}; }
+    void add(const void* from, void* to, int64_t bytes) { spans[count++] = {(const char*)from, (char*)to, bytes}; }
     inline void turn(int lines) {
         for (; lines > 0 && next < count; --lines) {
-            Span& span = spans[next];
-            half_a_line(span.from, span.to);
-            if (span.to + 32 < span.end) half_a_line(span.from + 32, span.to + 32);
-            span.from += 64;
-            if ((span.to += 64) >= span.end) ++next;
+            const Span& span = spans[next];
+            half_a_line(span.from + at, span.to + at);
+            if (at + 32 < span.bytes) half_a_line(span.from + at + 32, span.to + at + 32);
+            if ((at += 64) >= span.bytes) ++next, at = 0;
         }
     }
     void finish() {
