@@ -28,15 +28,7 @@ inline V load(const float* p) {
 }
 inline void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
 inline V all(float x) { return V{} + x; }
-inline V relu(V v) {  // keeps a NaN
-#if defined(__AVX512F__)
-    return (V)_mm512_max_ps(_mm512_setzero_ps(), (__m512)v);
-#elif defined(__AVX__)
-    return (V)_mm256_max_ps(_mm256_setzero_ps(), (__m256)v);
-#else
-    return v < 0.0f ? V{} : v;
-#endif
-}
+inline V relu(V v) { return v < 0.0f ? V{} : v; }  // keeps a NaN
 inline float total(V v) {
 #if defined(__AVX512F__)
     return _mm512_reduce_add_ps((__m512)v);  // in the order of below
