@@ -8,8 +8,9 @@ Which kernels a network takes on a CPU: torch's own, or ``block.cpp``, compiled 
 
 The compiled ones take a tile of rows through all layers of a block in registers and first-level cache, forward and backward:
 no array between two layers is written to memory unless the gradient needs it, and nothing passes over a tile twice. They need a
-C++ compiler and a processor with AVX-512, are compiled once per user, width and precision (some seconds) and kept in the
-user's cache folder. They work on one thread. Products of bfloat16 are by AMX where the processor has it.
+C++ compiler and vectors of eight numbers or more (AVX2, AVX-512), or 64-bit ARM, are compiled once per user, width and precision
+(some seconds) and kept in the user's cache folder. They work on one thread. bfloat16 needs AVX512_BF16; its products are by AMX
+where the processor has it.
 """
 
 from __future__ import annotations
