@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from network import NUM_BODY, Case, kept_rows, list_edges, naive, resident
+from network import NUM_BODY, Case, kept_rows, list_edges, naive, network_flops, resident
 from torch import Tensor
 
 from hood.app.settings.compose import load_config
@@ -280,28 +280,33 @@ def naive_table(args: argparse.Namespace) -> None:
 
 
 def kernels_table(args: argparse.Namespace) -> None:
-    columns = ("case", "vectors", "form", "update [ms]", "without scenes", "forward + backward", "vs torch", "", "", "loss off by")
+    spent = ("update [ms]", "without scenes", "forward + backward")
+    columns = ("case", "vectors", "form", *spent, "vs torch", "", "", "GFLOP", "GFLOP/s", "loss off by")
     print("\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
     vectors = torch.backends.cpu.get_cpu_capability()
     with tempfile.TemporaryDirectory() as folder:
         for case in args.cases:
-            times, losses = updates_in_turns(case, Path(folder), args)
+            times, losses, flops = updates_in_turns(case, Path(folder), args)
             off = max(abs(a - b) / abs(a) for a, b in zip(losses["torch"], losses["compiled"], strict=True))
             for form, of_form in times.items():
                 faster = " | ".join(f"{t / own:.2f}" for t, own in zip(times["torch"], of_form, strict=True))
-                spent = " | ".join(f"{1e3 * seconds:.0f}" for seconds in of_form)
-                print(f"| {case} | {vectors} | {form} | {spent} | {faster} | {off:.0e} |", flush=True)
+                parts = " | ".join(f"{1e3 * seconds:.0f}" for seconds in of_form)
+                rate = f"{3e-9 * flops:.1f} | {3e-9 * flops / of_form[-1]:.0f}"
+                print(f"| {case} | {vectors} | {form} | {parts} | {faster} | {rate} | {off:.0e} |", flush=True)
 
 
 def updates_in_turns(
     case: str, folder: Path, args: argparse.Namespace
-) -> tuple[dict[str, tuple[float, float, float]], dict[str, list[float]]]:
-    """By form, median CPU seconds of an update, of it without its scenes, and of forward and backward pass; and the losses."""
-    trainers = {}
+) -> tuple[dict[str, tuple[float, ...]], dict[str, list[float]], float]:
+    """By form, median CPU seconds of an update, of it without its scenes, and of forward and backward pass; the losses; and the
+    operations of a forward pass in products."""
+    trainers, flops = {}, list[float]()
     for form in ("torch", "compiled"):
         keys = (f"trainer.kernels={form}", "trainer.workers=0", "trainer.learning_rate=1e-12", *args.set)
         trainers[form] = trainer_for(case, folder, *keys)
         trainers[form].stopwatch = Stopwatch(time.process_time)
+    network = trainers["torch"].simulator.network
+    network.register_forward_pre_hook(lambda module, inputs: flops.append(network_flops(network, *inputs[:2])))
     times: dict[str, list[tuple[float, float, float]]] = {form: [] for form in trainers}
     losses: dict[str, list[float]] = {form: [] for form in trainers}
     for turn in range(args.updates + 2):
@@ -316,7 +321,8 @@ def updates_in_turns(
                 times[form].append((parts["total"], parts["total"] - parts["scenes"], both))
     # Scenes start every other update: means over pairs, and the median of these.
     pairs = {form: np.reshape(t[: len(t) // 2 * 2], (-1, 2, 3)).mean(axis=1) for form, t in times.items()}
-    return {form: tuple(np.median(t, axis=0).tolist()) for form, t in pairs.items()}, losses
+    medians = {form: tuple(np.median(t, axis=0).tolist()) for form, t in pairs.items()}
+    return medians, losses, float(np.median(flops))
 
 
 # ---- memory ----------------------------------------------------------------------------------------------------------

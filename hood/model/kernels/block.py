@@ -8,9 +8,9 @@ Which kernels a network takes on a CPU: torch's own, or ``block.cpp``, compiled 
 
 The compiled ones take a tile of rows through all layers of a block in registers and first-level cache, forward and backward:
 no array between two layers is written to memory unless the gradient needs it, and nothing passes over a tile twice. They need a
-C++ compiler and vectors of eight numbers or more (AVX2, AVX-512), or 64-bit ARM, are compiled once per user, width and precision
-(some seconds) and kept in the user's cache folder. They work on one thread. bfloat16 needs AVX512_BF16; its products are by AMX
-where the processor has it.
+C++ compiler and a processor with AVX2 or AVX-512 or of 64-bit ARM, are compiled once per user, width and precision (some
+seconds) and kept in the user's cache folder. They work on one thread. bfloat16 needs AVX512_BF16; its products are by AMX where
+the processor has it.
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ def _vector_flags() -> tuple[str, ...] | None:
 
 
 def panel(width: int) -> int:
-    """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32. Of AVX-512 there are 32 registers, twice
-    as many as others have, of twice the numbers."""
+    """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32. The registers of AVX-512 are twice as
+    many as those of AVX2, and hold twice the numbers."""
     choices = (64, 32, 48, _LANES) if _capability() == "AVX512" else (_LANES,)
     return next(columns for columns in choices if width % columns == 0)
 
@@ -137,7 +137,8 @@ def library(width: int, half: bool) -> ctypes.CDLL:
     Raises:
         ValueError: there is no compiler, or it fails.
     """
-    flags = [*_FLAGS, *(_vector_flags() or ()), f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(_HALF_FLAGS if half else [])]
+    shape = (f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}")
+    flags = [*_FLAGS, *(_vector_flags() or ()), *shape, *(_HALF_FLAGS if half else ())]
     if half and width % TILE_LANES == 0 and "amx_bf16" in processor().split():
         with suppress(BuildError):  # a compiler that does not know of them
             lib = build(SOURCE, [*flags, *_TILE_FLAGS])
