@@ -24,8 +24,9 @@ constexpr int VECTORS = D / LANES;
 constexpr int TILE = 96;          // rows: a tile's arrays stay in second-level cache, a panel of weights is used again
 constexpr int P = PANEL / LANES;  // vectors of a panel's columns
 constexpr int GROUP = SUMS / P;   // rows whose sums are in registers at a time
-constexpr int GRAM_ROWS = GROUP < D ? GROUP : D;  // the same for gradients of weights
-constexpr int AHEAD = 1536 / LANES;               // products of vectors between two lines that are asked for
+constexpr int FOURS = GROUP < 4 ? GROUP : GROUP / 4 * 4;
+constexpr int GRAM_ROWS = D % GROUP == 0 ? GROUP : FOURS < D ? FOURS : D;  // for gradients of weights; a rest of two rows is slow
+constexpr int AHEAD = 1536 / LANES;  // products of vectors between two lines that are asked for
 
 // ---- the precision of latents and factors; everything else is float32 ----------------------------------------------------
 
