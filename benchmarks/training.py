@@ -3,13 +3,16 @@
     python benchmarks/training.py --parts                    # time of every part, with and without a worker
     python benchmarks/training.py --naive                    # iterations/s in fp32 and bf16 against naive
     python benchmarks/training.py --memory                   # activation checkpointing: memory, time, gradients
+    python benchmarks/training.py --kernels                  # torch's operations and the compiled kernels, and their losses
 
 Updates are those of ``hood train`` (trainer=paper at horizon 1, its most expensive phase for the data, unless ``--set``
 says otherwise) on embedded garments; ``dress:5000`` is the largest dress below that size with its longest edges split until
 it has 5,000 vertices. ``--parts`` counts every part without the parts inside it, in wall-clock time, since waiting is what it
 is after. ``--naive`` replaces the network's forward pass by benchmarks/network.py's formulas, checks that both predict the
 same, and lets updates take turns on one scene each; times are medians of the process's CPU time, the naive
-form's own lists of edges not counted.
+form's own lists of edges not counted. ``--kernels`` lets updates in fp32 take turns in both forms, with a rate of learning that
+leaves the weights as they are, so that losses can be compared. ``ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2`` before the
+command has a processor with AVX-512 do without.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from network import NUM_BODY, Case, kept_rows, list_edges, naive, resident
+from network import NUM_BODY, Case, kept_rows, list_edges, naive, network_flops, resident
 from torch import Tensor
 
 from hood.app.settings.compose import load_config
@@ -39,6 +42,7 @@ from hood.cli.main import ENVIRONMENT
 from hood.mesh import topology
 from hood.model.graph.builder import BODY, Graph
 from hood.model.network.model import MeshGraphNet
+from hood.steppers.protocol import Stopwatch
 from hood.training.trainer import Trainer
 
 PARTS = ("data", "search", "features", "network", "energies", "backward", "optimiser", "rest")
@@ -272,6 +276,55 @@ def naive_table(args: argparse.Namespace) -> None:
                 )
 
 
+# ---- kernels ---------------------------------------------------------------------------------------------------------
+
+
+def kernels_table(args: argparse.Namespace) -> None:
+    spent = ("update [ms]", "without scenes", "forward + backward")
+    columns = ("case", "vectors", "form", *spent, "vs torch", "", "", "GFLOP", "GFLOP/s", "loss off by")
+    print("\n| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    vectors = torch.backends.cpu.get_cpu_capability()
+    with tempfile.TemporaryDirectory() as folder:
+        for case in args.cases:
+            times, losses, flops = updates_in_turns(case, Path(folder), args)
+            off = max(abs(a - b) / abs(a) for a, b in zip(losses["torch"], losses["compiled"], strict=True))
+            for form, of_form in times.items():
+                faster = " | ".join(f"{t / own:.2f}" for t, own in zip(times["torch"], of_form, strict=True))
+                parts = " | ".join(f"{1e3 * seconds:.0f}" for seconds in of_form)
+                rate = f"{3e-9 * flops:.1f} | {3e-9 * flops / of_form[-1]:.0f}"
+                print(f"| {case} | {vectors} | {form} | {parts} | {faster} | {rate} | {off:.0e} |", flush=True)
+
+
+def updates_in_turns(
+    case: str, folder: Path, args: argparse.Namespace
+) -> tuple[dict[str, tuple[float, ...]], dict[str, list[float]], float]:
+    """By form, median CPU seconds of an update, of it without its scenes, and of forward and backward pass; the losses; and the
+    operations of a forward pass in products."""
+    trainers, flops = {}, list[float]()
+    for form in ("torch", "compiled"):
+        keys = (f"trainer.kernels={form}", "trainer.workers=0", "trainer.learning_rate=1e-12", *args.set)
+        trainers[form] = trainer_for(case, folder, *keys)
+        trainers[form].stopwatch = Stopwatch(time.process_time)
+    network = trainers["torch"].simulator.network
+    network.register_forward_pre_hook(lambda module, inputs: flops.append(network_flops(network, *inputs[:2])))
+    times: dict[str, list[tuple[float, float, float]]] = {form: [] for form in trainers}
+    losses: dict[str, list[float]] = {form: [] for form in trainers}
+    for turn in range(args.updates + 2):
+        for form, trainer in trainers.items():
+            watch = trainer.stopwatch
+            assert watch is not None
+            watch.lap()
+            losses[form].append(trainer.update()["loss"])
+            parts = {name: milliseconds / 1e3 for name, milliseconds in watch.lap().items()}
+            both = sum(parts[part] for part in ("features", "network", "backward"))
+            if turn > 1:
+                times[form].append((parts["total"], parts["total"] - parts["scenes"], both))
+    # Scenes start every other update: means over pairs, and the median of these.
+    pairs = {form: np.reshape(t[: len(t) // 2 * 2], (-1, 2, 3)).mean(axis=1) for form, t in times.items()}
+    medians = {form: tuple(np.median(t, axis=0).tolist()) for form, t in pairs.items()}
+    return medians, losses, float(np.median(flops))
+
+
 # ---- memory ----------------------------------------------------------------------------------------------------------
 
 
@@ -314,6 +367,7 @@ def main() -> None:
     parser.add_argument("--parts", action="store_true", help="time of every part of an update")
     parser.add_argument("--naive", action="store_true", help="rate against the same update with the naive network")
     parser.add_argument("--memory", action="store_true", help="what activation checkpointing saves and costs")
+    parser.add_argument("--kernels", action="store_true", help="torch's operations and the compiled kernels, in turns")
     parser.add_argument("--cases", nargs="+", default=list(CASES), help="'MODEL GARMENT' each")
     parser.add_argument("--workers", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--updates", type=int, default=20)
@@ -327,10 +381,9 @@ def main() -> None:
     if args.memory_of:
         memory_of(*args.memory_of, args.set)
         return
-    chosen = [
-        table for name, table in (("parts", parts_table), ("naive", naive_table), ("memory", memory_table)) if vars(args)[name]
-    ]
-    for table in chosen or [parts_table, naive_table, memory_table]:
+    tables = {"parts": parts_table, "naive": naive_table, "memory": memory_table, "kernels": kernels_table}
+    chosen = [table for name, table in tables.items() if vars(args)[name]]
+    for table in chosen or tables.values():
         table(args)
 
 

@@ -1,14 +1,13 @@
 // One network block over rows, tile by tile, in registers and first-level cache: first layer (of an edge network), second and
 // third layer, layer norm, residual and the sums at the receivers; forward and backward. Built by hood/model/kernels/block.py with
-// WIDTH, a multiple of 16, PANEL, 16 to 64 columns that divide it, and HALF, 1 for bfloat16 and 0 for float32. Where the compiler
-// is told of AMX, products of bfloat16 with widths of a multiple of 32 are by its tiles.
-#include <immintrin.h>
-
+// WIDTH, a multiple of 16, PANEL, 16 to 64 columns that divide it, and HALF, 1 for bfloat16 and 0 for float32. bfloat16 needs
+// AVX-512. Where the compiler is told of AMX, its products with widths of a multiple of 32 are by tiles.
 #include <cstdint>
 #include <cstring>
 #include <initializer_list>
 
 #include "ahead.h"
+#include "floats.h"
 
 #if HALF && defined(__AMX_BF16__) && WIDTH % 32 == 0
 #define TILES 1
@@ -21,37 +20,47 @@
 namespace {
 
 constexpr int D = WIDTH;
-constexpr int TILE = 96;           // rows: a tile's arrays stay in second-level cache, a panel of weights is used again
-constexpr int V = PANEL / 16;      // registers of 16 numbers for a panel's columns
-constexpr int GROUP = 24 / V;      // rows whose sums are in registers at a time
-constexpr int GRAM_ROWS = 16 / V / 4 * 4;  // the same for gradients of weights; divides 16
+constexpr int VECTORS = D / LANES;
+constexpr int TILE = 96;          // rows: a tile's arrays stay in second-level cache, a panel of weights is used again
+constexpr int P = PANEL / LANES;  // vectors of a panel's columns
+constexpr int GROUP = SUMS / P;   // rows whose sums are in registers at a time
+constexpr int FOURS = GROUP < 4 ? GROUP : GROUP / 4 * 4;
+constexpr int GRAM_ROWS = D % GROUP == 0 ? GROUP : FOURS < D ? FOURS : D;  // for gradients of weights; a rest of two rows is slow
+constexpr int AHEAD = 1536 / LANES;  // products of vectors between two lines that are asked for
 
 // ---- the precision of latents and factors; everything else is float32 ----------------------------------------------------
 
 #if HALF
 using T = uint16_t;
-inline __m512 load(const T* p) {
-    return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)p)), 16));
+using Word = uint32_t __attribute__((may_alias));
+using Factors = __m512i;
+inline V load(const T* p) {
+    return (V)_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)p)), 16);
 }
-inline void store(T* p, __m512 v) { _mm256_storeu_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh(v)); }
-inline void stream(T* p, __m512 v) { _mm256_stream_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh(v)); }
-inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
-    return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_set1_epi32((int)a), (__m512bh)b);
+inline void store(T* p, V v) { _mm256_storeu_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh((__m512)v)); }
+inline void stream(T* p, V v) { _mm256_stream_si256((__m256i*)p, (__m256i)_mm512_cvtneps_pbh((__m512)v)); }
+inline Factors factors(const Word* p) { return _mm512_loadu_si512(p); }
+inline V multiply(V sum, Word a, Factors b) {
+    return (V)_mm512_dpbf16_ps((__m512)sum, (__m512bh)_mm512_set1_epi32((int)a), (__m512bh)b);
 }
 #else
 using T = float;
-inline __m512 load(const T* p) { return _mm512_loadu_ps(p); }
-inline void store(T* p, __m512 v) { _mm512_storeu_ps(p, v); }
-inline void stream(T* p, __m512 v) { _mm512_stream_ps(p, v); }
-inline __m512 multiply(__m512 sum, uint32_t a, __m512i b) {
-    return _mm512_fmadd_ps(_mm512_castsi512_ps(_mm512_set1_epi32((int)a)), _mm512_castsi512_ps(b), sum);
+using Word = float;
+using Factors = V;
+inline void stream(T* p, V v) {
+#if defined(__AVX512F__)
+    _mm512_stream_ps(p, (__m512)v);
+#elif defined(__AVX__)
+    _mm256_stream_ps(p, (__m256)v);
+#else
+    store(p, v);
+#endif
 }
+inline Factors factors(const Word* p) { return load(p); }
+inline V multiply(V sum, Word a, Factors b) { return sum + a * b; }
 #endif
 constexpr int PER_WORD = 4 / sizeof(T);  // factors in 32 bits: a product adds that many terms at once
 constexpr int WORDS = D / PER_WORD;
-using Word = uint32_t __attribute__((may_alias));
-
-inline __m512 relu(__m512 v) { return _mm512_max_ps(_mm512_setzero_ps(), v); }  // keeps a NaN
 
 // ---- memory --------------------------------------------------------------------------------------------------------------
 
@@ -61,20 +70,29 @@ class Behind {
     static constexpr int MOST = 4;  // arrays of a tile
     struct Span {
         const char* from;
-        char *to, *end;
+        char* to;
+        int64_t bytes;
     };
     Span spans[MOST];
     int count = 0, next = 0;
+    int64_t at = 0;  // of the next span
+
+    static inline void half_a_line(const char* from, char* to) {
+#if defined(__AVX__)
+        _mm256_stream_si256((__m256i*)to, _mm256_loadu_si256((const __m256i*)from));
+#else
+        std::memcpy(to, from, 32);
+#endif
+    }
 
   public:
-    void add(const void* from, void* to, int64_t bytes) { spans[count++] = {(const char*)from, (char*)to, (char*)to + bytes}; }
+    void add(const void* from, void* to, int64_t bytes) { spans[count++] = {(const char*)from, (char*)to, bytes}; }
     inline void turn(int lines) {
         for (; lines > 0 && next < count; --lines) {
-            Span& span = spans[next];
-            _mm256_stream_si256((__m256i*)span.to, _mm256_loadu_si256((const __m256i*)span.from));
-            if (span.to + 32 < span.end) _mm256_stream_si256((__m256i*)(span.to + 32), _mm256_loadu_si256((const __m256i*)(span.from + 32)));
-            span.from += 64;
-            if ((span.to += 64) >= span.end) ++next;
+            const Span& span = spans[next];
+            half_a_line(span.from + at, span.to + at);
+            if (at + 32 < span.bytes) half_a_line(span.from + at + 32, span.to + at + 32);
+            if ((at += 64) >= span.bytes) ++next, at = 0;
         }
     }
     void finish() {
@@ -82,6 +100,13 @@ class Behind {
         count = next = 0;
     }
 };
+
+// waits until what was written past the caches is in memory
+inline void flush_writes() {
+#if defined(__AVX__)
+    _mm_sfence();
+#endif
+}
 
 struct Traffic {
     Ahead ahead;
@@ -95,21 +120,21 @@ struct Traffic {
 // ---- products ------------------------------------------------------------------------------------------------------------
 
 template <int R>
-inline void accumulate_step(__m512 (&sum)[R][V], const Word* a, int64_t a_row, const Word* b) {
-    __m512i column[V];
+inline void accumulate_step(V (&sum)[R][P], const Word* a, int64_t a_row, const Word* b) {
+    Factors column[P];
 #pragma GCC unroll 4
-    for (int j = 0; j < V; ++j) column[j] = _mm512_loadu_si512(b + 16 * j);
+    for (int j = 0; j < P; ++j) column[j] = factors(b + LANES * j);
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
 #pragma GCC unroll 4
-        for (int j = 0; j < V; ++j) sum[r][j] = multiply(sum[r][j], a[r * a_row], column[j]);
+        for (int j = 0; j < P; ++j) sum[r][j] = multiply(sum[r][j], a[r * a_row], column[j]);
 }
 
 // sums over k of a[r * a_row + k * a_step] * b[k * b_step + …] for R rows and a panel of columns
 template <int R>
-inline void accumulate(__m512 (&sum)[R][V], const Word* a, int64_t a_row, int64_t a_step, const Word* b, int64_t b_step, int steps,
+inline void accumulate(V (&sum)[R][P], const Word* a, int64_t a_row, int64_t a_step, const Word* b, int64_t b_step, int steps,
                        Traffic& traffic) {
-    constexpr int STEPS = 96 / (R * V);
+    constexpr int STEPS = AHEAD / (R * P);
     int k = 0;
     for (; k + STEPS <= steps; k += STEPS) {
         traffic.turn();
@@ -121,17 +146,17 @@ inline void accumulate(__m512 (&sum)[R][V], const Word* a, int64_t a_row, int64_
 
 template <int R, class Emit>
 inline void rows_product(const T* x, const T* weight, int row, int column, Traffic& traffic, const Emit& emit) {
-    __m512 sum[R][V];
+    V sum[R][P];
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
 #pragma GCC unroll 4
-        for (int j = 0; j < V; ++j) sum[r][j] = _mm512_setzero_ps();
+        for (int j = 0; j < P; ++j) sum[r][j] = V{};
     accumulate<R>(sum, (const Word*)(x + (int64_t)row * D), WORDS, 1, (const Word*)weight + (int64_t)column * WORDS, PANEL, WORDS,
                   traffic);
 #pragma GCC unroll 24
     for (int r = 0; r < R; ++r)
 #pragma GCC unroll 4
-        for (int j = 0; j < V; ++j) emit(row + r, column + 16 * j, sum[r][j]);
+        for (int j = 0; j < P; ++j) emit(row + r, column + LANES * j, sum[r][j]);
 }
 
 #if TILES
@@ -199,8 +224,8 @@ void product(const T* x, int rows, const T* weight, Traffic& traffic, const Emit
             _tile_stored(3, sum[16] + 16, sizeof sum[0]);
             settle();
             for (int r = 0; r < present; ++r) {
-                emit(row + r, column, _mm512_load_ps(sum[r]));
-                emit(row + r, column + 16, _mm512_load_ps(sum[r] + 16));
+                emit(row + r, column, load(sum[r]));
+                emit(row + r, column + 16, load(sum[r] + 16));
             }
         }
     }
@@ -210,7 +235,7 @@ void product(const T* x, int rows, const T* weight, Traffic& traffic, const Emit
 
 struct Tiles {};
 
-// emit(row, column, 16 values) of x W for all rows of a tile; the weight lies in panels of columns
+// emit(row, column, a vector) of x W for all rows of a tile; the weight lies in panels of columns
 template <class Emit>
 void product(const T* x, int rows, const T* weight, Traffic& traffic, const Emit& emit) {
     for (int column = 0; column < D; column += PANEL) {
@@ -294,6 +319,22 @@ void gram(const T* left, const T* right, int rows, float* total, Traffic& traffi
 
 #else
 
+// R rows of total, of a panel of columns, += leftᵀ right over the rows of a tile
+template <int R>
+inline void gram_rows(const Word* left, const Word* right, int steps, float* total, int row, int column, Traffic& traffic) {
+    V sum[R][P];
+    float* at = total + (int64_t)row * D + column;
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < P; ++j) sum[r][j] = load(at + r * D + LANES * j);
+    accumulate<R>(sum, left + row, 1, D, right + column, D, steps, traffic);
+#pragma GCC unroll 24
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int j = 0; j < P; ++j) store(at + r * D + LANES * j, sum[r][j]);
+}
+
 // total += leftᵀ right over the rows of a tile
 void gram(const T* left, const T* right, int rows, float* total, Traffic& traffic) {
     alignas(64) static thread_local T a[TILE * D], b[TILE * D];
@@ -303,40 +344,33 @@ void gram(const T* left, const T* right, int rows, float* total, Traffic& traffi
         left = a, right = b;
     }
     const int steps = (rows + PER_WORD - 1) / PER_WORD;
-    for (int column = 0; column < D; column += PANEL)
-        for (int row = 0; row < D; row += GRAM_ROWS) {
-            __m512 sum[GRAM_ROWS][V];
-            float* at = total + (int64_t)row * D + column;
-#pragma GCC unroll 16
-            for (int r = 0; r < GRAM_ROWS; ++r)
-#pragma GCC unroll 4
-                for (int j = 0; j < V; ++j) sum[r][j] = _mm512_loadu_ps(at + r * D + 16 * j);
-            accumulate<GRAM_ROWS>(sum, (const Word*)left + row, 1, D, (const Word*)right + column, D, steps, traffic);
-#pragma GCC unroll 16
-            for (int r = 0; r < GRAM_ROWS; ++r)
-#pragma GCC unroll 4
-                for (int j = 0; j < V; ++j) _mm512_storeu_ps(at + r * D + 16 * j, sum[r][j]);
-        }
+    constexpr int REST = D % GRAM_ROWS;
+    for (int column = 0; column < D; column += PANEL) {
+        int row = 0;
+        for (; row + GRAM_ROWS <= D; row += GRAM_ROWS)
+            gram_rows<GRAM_ROWS>((const Word*)left, (const Word*)right, steps, total, row, column, traffic);
+        if constexpr (REST > 0) gram_rows<REST>((const Word*)left, (const Word*)right, steps, total, row, column, traffic);
+    }
 }
 
 #endif
 
-inline void add_to(float* total, __m512 v) { _mm512_storeu_ps(total, _mm512_add_ps(_mm512_loadu_ps(total), v)); }
+inline void add_to(float* total, V v) { store(total, load(total) + v); }
 
 // total += sum of the rows of a tile
 inline void add_rows(const T* x, int rows, float* total) {
     for (int c = 0; c < D; c += PANEL) {
-        __m512 sum[V];
-        for (int j = 0; j < V; ++j) sum[j] = _mm512_loadu_ps(total + c + 16 * j);
+        V sum[P];
+        for (int j = 0; j < P; ++j) sum[j] = load(total + c + LANES * j);
         for (int r = 0; r < rows; ++r)
 #pragma GCC unroll 4
-            for (int j = 0; j < V; ++j) sum[j] = _mm512_add_ps(sum[j], load(x + (int64_t)r * D + c + 16 * j));
-        for (int j = 0; j < V; ++j) _mm512_storeu_ps(total + c + 16 * j, sum[j]);
+            for (int j = 0; j < P; ++j) sum[j] += load(x + (int64_t)r * D + c + LANES * j);
+        for (int j = 0; j < P; ++j) store(total + c + LANES * j, sum[j]);
     }
 }
 
-inline __m512 load_any(const void* p, int64_t at, int wide) {
-    return wide ? _mm512_loadu_ps((const float*)p + at) : load((const T*)p + at);
+inline V load_any(const void* p, int64_t at, int wide) {
+    return wide ? load((const float*)p + at) : load((const T*)p + at);
 }
 
 // sums of consecutive rows of the same receiver
@@ -353,7 +387,7 @@ struct Sums {
     }
     void flush() {
         if (node >= 0)
-            for (int c = 0; c < D; c += 16) store(out + node * D + c, _mm512_loadu_ps(sum + c));
+            for (int c = 0; c < D; c += LANES) store(out + node * D + c, load(sum + c));
     }
 };
 
@@ -411,20 +445,19 @@ void fetch(Ahead& ahead, const Block* b, int64_t start) {
 }
 
 // layer norm of a row: its normalised numbers, and 1 / their deviation before
-inline float normalise(const float* row, float eps, __m512 (&hat)[D / 16]) {
-    __m512 total = _mm512_setzero_ps(), square = _mm512_setzero_ps();
+inline float normalise(const float* row, float eps, V (&hat)[VECTORS]) {
+    V sum = V{}, square = V{};
 #pragma GCC unroll 16
-    for (int j = 0; j < D / 16; ++j) total = _mm512_add_ps(total, hat[j] = _mm512_loadu_ps(row + 16 * j));
-    const __m512 mean = _mm512_set1_ps(_mm512_reduce_add_ps(total) / D);
+    for (int j = 0; j < VECTORS; ++j) sum += hat[j] = load(row + LANES * j);
+    const float mean = total(sum) / D;
 #pragma GCC unroll 16
-    for (int j = 0; j < D / 16; ++j) {
-        hat[j] = _mm512_sub_ps(hat[j], mean);
-        square = _mm512_fmadd_ps(hat[j], hat[j], square);
+    for (int j = 0; j < VECTORS; ++j) {
+        hat[j] -= mean;
+        square += hat[j] * hat[j];
     }
-    const float rstd = 1.0f / __builtin_sqrtf(_mm512_reduce_add_ps(square) / D + eps);
-    const __m512 factor = _mm512_set1_ps(rstd);
+    const float rstd = 1.0f / __builtin_sqrtf(total(square) / D + eps);
 #pragma GCC unroll 16
-    for (int j = 0; j < D / 16; ++j) hat[j] = _mm512_mul_ps(hat[j], factor);
+    for (int j = 0; j < VECTORS; ++j) hat[j] *= rstd;
     return rstd;
 }
 
@@ -447,35 +480,33 @@ extern "C" void forward(const Block* b) {
         };
         if (b->table) {
             const int64_t *receivers = b->receivers + start, *senders = b->senders + start;
-            product(x, rows, b->first, traffic, [&](int r, int c, __m512 v) {
-                const __m512 ends = _mm512_add_ps(load(b->table + receivers[r] * 2 * D + c), load(b->table + senders[r] * 2 * D + D + c));
-                store(one + r * D + c, relu(_mm512_add_ps(v, ends)));
+            product(x, rows, b->first, traffic, [&](int r, int c, V v) {
+                const V ends = load(b->table + receivers[r] * 2 * D + c) + load(b->table + senders[r] * 2 * D + D + c);
+                store(one + r * D + c, relu(v + ends));
             });
         } else {
-            for (int i = 0; i < rows * D; i += 16) store(one + i, relu(load(x + i)));
+            for (int i = 0; i < rows * D; i += LANES) store(one + i, relu(load(x + i)));
         }
         write(one, b->one, sizeof(T));
-        product(one, rows, b->second, traffic,
-                [&](int r, int c, __m512 v) { store(two + r * D + c, relu(_mm512_add_ps(v, _mm512_loadu_ps(b->bias_2 + c)))); });
+        product(one, rows, b->second, traffic, [&](int r, int c, V v) { store(two + r * D + c, relu(v + load(b->bias_2 + c))); });
         write(two, b->two, sizeof(T));
-        product(two, rows, b->third, traffic,
-                [&](int r, int c, __m512 v) { _mm512_storeu_ps(raw + r * D + c, _mm512_add_ps(v, _mm512_loadu_ps(b->bias_3 + c))); });
+        product(two, rows, b->third, traffic, [&](int r, int c, V v) { store(raw + r * D + c, v + load(b->bias_3 + c)); });
         traffic.behind.finish();
         void* result = keep ? (void*)outs : (char*)b->out + start * D * out_bytes;
         for (int r = 0; r < rows; ++r) {
-            __m512 hat[D / 16];
+            V hat[VECTORS];
             const float rstd = normalise(raw + r * D, (float)b->eps, hat);
             if (keep) b->rstd[start + r] = rstd;
             if (b->received) sums.move(b->receivers[start + r]);
 #pragma GCC unroll 16
-            for (int j = 0; j < D / 16; ++j) {
-                const int c = 16 * j, i = r * D + c;
+            for (int j = 0; j < VECTORS; ++j) {
+                const int c = LANES * j, i = r * D + c;
                 if (keep) store(hats + i, hat[j]);
-                __m512 out = _mm512_fmadd_ps(hat[j], _mm512_loadu_ps(b->scale + c), _mm512_loadu_ps(b->shift + c));
+                V out = hat[j] * load(b->scale + c) + load(b->shift + c);
                 if (b->received) add_to(sums.sum + c, out);
-                if (b->residual) out = _mm512_add_ps(out, load_any(b->residual, start * D + i, b->wide));
+                if (b->residual) out += load_any(b->residual, start * D + i, b->wide);
                 if (b->wide)
-                    _mm512_storeu_ps((float*)result + i, out);
+                    store((float*)result + i, out);
                 else
                     store((T*)result + i, out);
             }
@@ -484,7 +515,7 @@ extern "C" void forward(const Block* b) {
         write(outs, b->out, out_bytes);
     }
     traffic.behind.finish();
-    _mm_sfence();
+    flush_writes();
     if (b->received) sums.flush();
 }
 
@@ -522,26 +553,25 @@ void fetch(Ahead& ahead, const Gradient* b, int64_t start) {
 void through_norm(const Gradient* b, int64_t start, int rows, T* out) {
     for (int r = 0; r < rows; ++r) {
         const int64_t at = (start + r) * D;
-        __m512 g[D / 16], mean = _mm512_setzero_ps(), along = _mm512_setzero_ps();
+        V g[VECTORS], mean = V{}, along = V{};
         const T* sum = b->grad_sum ? b->grad_sum + b->receivers[start + r] * D : nullptr;
 #pragma GCC unroll 16
-        for (int j = 0; j < D / 16; ++j) {
-            const int c = 16 * j;
-            const __m512 h = load(b->hat + at + c);
-            g[j] = b->grad ? load_any(b->grad, at + c, b->wide) : _mm512_setzero_ps();
-            if (sum) g[j] = _mm512_add_ps(g[j], load(sum + c));
+        for (int j = 0; j < VECTORS; ++j) {
+            const int c = LANES * j;
+            const V h = load(b->hat + at + c);
+            g[j] = b->grad ? load_any(b->grad, at + c, b->wide) : V{};
+            if (sum) g[j] += load(sum + c);
             add_to(b->grad_shift + c, g[j]);
-            add_to(b->grad_scale + c, _mm512_mul_ps(g[j], h));
-            g[j] = _mm512_mul_ps(g[j], _mm512_loadu_ps(b->scale + c));
-            mean = _mm512_add_ps(mean, g[j]);
-            along = _mm512_fmadd_ps(g[j], h, along);
+            add_to(b->grad_scale + c, g[j] * h);
+            g[j] *= load(b->scale + c);
+            mean += g[j];
+            along += g[j] * h;
         }
-        const __m512 m = _mm512_set1_ps(_mm512_reduce_add_ps(mean) / D), a = _mm512_set1_ps(_mm512_reduce_add_ps(along) / D);
-        const __m512 factor = _mm512_set1_ps(b->rstd[start + r]);
+        const float m = total(mean) / D, a = total(along) / D, factor = b->rstd[start + r];
 #pragma GCC unroll 16
-        for (int j = 0; j < D / 16; ++j) {
-            const __m512 h = load(b->hat + at + 16 * j);
-            store(out + r * D + 16 * j, _mm512_mul_ps(_mm512_sub_ps(g[j], _mm512_fmadd_ps(a, h, m)), factor));
+        for (int j = 0; j < VECTORS; ++j) {
+            const V h = load(b->hat + at + LANES * j);
+            store(out + r * D + LANES * j, (g[j] - (a * h + m)) * factor);
         }
     }
 }
@@ -551,8 +581,8 @@ void add_to_ends(const Gradient* b, int64_t start, int rows, const T* hidden) {
     for (int r = 0; r < rows; ++r) {
         float* receiver = b->grad_table + b->receivers[start + r] * 2 * D;
         float* sender = b->grad_table + b->senders[start + r] * 2 * D + D;
-        for (int c = 0; c < D; c += 16) {
-            const __m512 v = load(hidden + r * D + c);
+        for (int c = 0; c < D; c += LANES) {
+            const V v = load(hidden + r * D + c);
             add_to(receiver + c, v);
             add_to(sender + c, v);
         }
@@ -568,30 +598,28 @@ extern "C" void backward(const Gradient* b) {
     for (int64_t start = 0; start < b->count; start += TILE) {
         const int rows = rows_from(b->count, start);
         const T *one = b->one + start * D, *two = b->two + start * D;
-        const auto through_relu = [](const T* output, __m512 v) {
-            return _mm512_maskz_mov_ps(_mm512_cmp_ps_mask(load(output), _mm512_setzero_ps(), _CMP_GT_OQ), v);
-        };
+        const auto through_relu = [](const T* output, V v) { return load(output) > 0.0f ? v : V{}; };
         fetch(traffic.ahead, b, start);
         through_norm(b, start, rows, third);
         add_rows(third, rows, b->grad_bias_3);
         gram(third, two, rows, b->grad_third, traffic);
         product(third, rows, b->third, traffic,
-                [&](int r, int c, __m512 v) { store(second + r * D + c, through_relu(two + r * D + c, v)); });
+                [&](int r, int c, V v) { store(second + r * D + c, through_relu(two + r * D + c, v)); });
         add_rows(second, rows, b->grad_bias_2);
         gram(second, one, rows, b->grad_second, traffic);
         if (!b->first) {
             product(second, rows, b->second, traffic,
-                    [&](int r, int c, __m512 v) { stream(b->grad_x + (start + r) * D + c, through_relu(one + r * D + c, v)); });
+                    [&](int r, int c, V v) { stream(b->grad_x + (start + r) * D + c, through_relu(one + r * D + c, v)); });
             continue;
         }
         product(second, rows, b->second, traffic,
-                [&](int r, int c, __m512 v) { store(hidden + r * D + c, through_relu(one + r * D + c, v)); });
+                [&](int r, int c, V v) { store(hidden + r * D + c, through_relu(one + r * D + c, v)); });
         gram(hidden, b->x + start * D, rows, b->grad_first, traffic);
-        product(hidden, rows, b->first, traffic, [&](int r, int c, __m512 v) {
+        product(hidden, rows, b->first, traffic, [&](int r, int c, V v) {
             const int64_t i = (start + r) * D + c;
-            stream(b->grad_x + i, b->grad ? _mm512_add_ps(v, load((const T*)b->grad + i)) : v);
+            stream(b->grad_x + i, b->grad ? v + load((const T*)b->grad + i) : v);
         });
         add_to_ends(b, start, rows, hidden);
     }
-    _mm_sfence();
+    flush_writes();
 }

@@ -6,49 +6,14 @@
 #include <cstring>
 
 #include "ahead.h"
-
-#if defined(__AVX512F__)
-#include <immintrin.h>
-#endif
+#include "floats.h"
 
 namespace {
 
-#if defined(__AVX512F__)
-constexpr int LANES = 16, SUMS = 24;  // numbers in a vector, and sums that are in registers at a time
-#elif defined(__AVX__)
-constexpr int LANES = 8, SUMS = 12;
-#elif defined(__aarch64__)
-constexpr int LANES = 4, SUMS = 24;
-#else
-constexpr int LANES = 4, SUMS = 12;
-#endif
 constexpr int TILE = 96;       // rows: a multiple of every group of rows below
 constexpr int MOST = 512;      // columns of a latent
 constexpr int STEPS = 4;       // terms of a sum between two lines that are asked for
 alignas(64) constexpr float NOTHING[MOST] = {};
-
-typedef float V __attribute__((vector_size(4 * LANES)));
-typedef decltype(V{} > V{}) Mask;
-
-inline V load(const float* p) {
-    V v;
-    std::memcpy(&v, p, sizeof v);
-    return v;
-}
-inline void store(float* p, V v) { std::memcpy(p, &v, sizeof v); }
-inline V all(float x) { return V{} + x; }
-inline V relu(V v) { return v < 0.0f ? V{} : v; }  // keeps a NaN
-inline float total(V v) {
-#if defined(__AVX512F__)
-    return _mm512_reduce_add_ps((__m512)v);  // in the order of below
-#else
-    float half[LANES];
-    store(half, v);
-    for (int width = LANES / 2; width > 0; width /= 2)
-        for (int i = 0; i < width; ++i) half[i] += half[i + width];
-    return half[0];
-#endif
-}
 
 constexpr int padded(int64_t count) { return (int)((count + LANES - 1) / LANES * LANES); }
 

@@ -8,13 +8,15 @@ Which kernels a network takes on a CPU: torch's own, or ``block.cpp``, compiled 
 
 The compiled ones take a tile of rows through all layers of a block in registers and first-level cache, forward and backward:
 no array between two layers is written to memory unless the gradient needs it, and nothing passes over a tile twice. They need a
-C++ compiler and a processor with AVX-512, are compiled once per user, width and precision (some seconds) and kept in the
-user's cache folder. They work on one thread. Products of bfloat16 are by AMX where the processor has it.
+C++ compiler and a processor with AVX2 or AVX-512 or of 64-bit ARM, are compiled once per user, width and precision (some
+seconds) and kept in the user's cache folder. They work on one thread. bfloat16 needs AVX512_BF16; its products are by AMX where
+the processor has it.
 """
 
 from __future__ import annotations
 
 import ctypes
+import platform
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -34,10 +36,12 @@ from hood.tensors.dense import is_whole
 #: ``torch``: torch's operations, everywhere; ``compiled``: the blocks of the network in C++; ``fused``: whole passes of an
 #: inference in C++ (:mod:`hood.model.kernels.network`), gradients by torch's operations.
 KERNELS = ("torch", "compiled", "fused")
-#: Widths of latents are a multiple of this: numbers in a register.
+#: Widths of latents are a multiple of this: numbers in the widest register.
 _LANES = 16
 SOURCE = Path(native.__file__).with_name("block.cpp")
-_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-mfma", *(f"-mavx512{part}" for part in ("f", "bw", "dq", "vl")))
+_FLAGS = ("-O3", "-std=c++17", "-shared", "-fPIC", "-Wno-psabi")
+#: For what torch finds that the processor can do; it can be told to find less (``ATEN_CPU_CAPABILITY``).
+_VECTOR_FLAGS = {"AVX512": ("-mfma", *(f"-mavx512{part}" for part in ("f", "bw", "dq", "vl"))), "AVX2": ("-mavx2", "-mfma")}
 _HALF_FLAGS = ("-mavx512bf16",)
 _TILE_FLAGS = ("-mamx-tile", "-mamx-bf16")
 #: Widths of latents are a multiple of this for AMX: the terms that one of its instructions adds up.
@@ -82,8 +86,8 @@ def check_kernels(name: str, precision: str, width: int, device: torch.device | 
         return
     if width % _LANES:
         raise ValueError(f"kernels=compiled need latents of a multiple of {_LANES} columns, not {width}; use kernels=torch")
-    if torch.backends.cpu.get_cpu_capability() != "AVX512":
-        raise ValueError("kernels=compiled need a processor with AVX-512; use kernels=torch")
+    if _vector_flags() is None:
+        raise ValueError("kernels=compiled need a processor with AVX2 or AVX-512; use kernels=torch")
     if precision == "bf16" and not _multiplies_bfloat16():
         raise ValueError("kernels=compiled with precision=bf16 need a processor with AVX512_BF16; use kernels=torch")
     library(width, precision == "bf16")
@@ -98,9 +102,20 @@ def _check_fused(precision: str, width: int) -> None:
         raise ValueError(f"kernels=fused: {error} or use kernels=torch") from error
 
 
+def _capability() -> str:
+    return torch.backends.cpu.get_cpu_capability()
+
+
+def _vector_flags() -> tuple[str, ...] | None:
+    """For the compiler; None for a processor that lacks the vectors. All of 64-bit ARM have theirs."""
+    return () if platform.machine() in ("aarch64", "arm64") else _VECTOR_FLAGS.get(_capability())
+
+
 def panel(width: int) -> int:
-    """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32."""
-    return next(columns for columns in (64, 32, 48, _LANES) if width % columns == 0)
+    """Columns of ``width`` whose sums are in registers at a time; tiles of AMX take 32. The registers of AVX-512 are twice as
+    many as those of AVX2, and hold twice the numbers."""
+    choices = (64, 32, 48, _LANES) if _capability() == "AVX512" else (_LANES,)
+    return next(columns for columns in choices if width % columns == 0)
 
 
 def _call(function: str, values: ctypes.Structure, width: int, half: bool) -> None:
@@ -122,7 +137,8 @@ def library(width: int, half: bool) -> ctypes.CDLL:
     Raises:
         ValueError: there is no compiler, or it fails.
     """
-    flags = [*_FLAGS, f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}", *(_HALF_FLAGS if half else [])]
+    shape = (f"-DWIDTH={width}", f"-DPANEL={panel(width)}", f"-DHALF={int(half)}")
+    flags = [*_FLAGS, *(_vector_flags() or ()), *shape, *(_HALF_FLAGS if half else ())]
     if half and width % TILE_LANES == 0 and "amx_bf16" in processor().split():
         with suppress(BuildError):  # a compiler that does not know of them
             lib = build(SOURCE, [*flags, *_TILE_FLAGS])
@@ -145,7 +161,7 @@ def why_slow(precision: str, device: torch.device) -> str:
 
 def _multiplies_bfloat16() -> bool:
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)  # missing in other versions of torch
-    return supported is not None and bool(supported())
+    return _capability() == "AVX512" and supported is not None and bool(supported())
 
 
 def applies(x: Tensor, parameters: tuple[Tensor, ...]) -> bool:

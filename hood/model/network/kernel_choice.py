@@ -140,7 +140,8 @@ def _digest(precision: str, width: int, training: bool) -> str:
     except BuildError:
         compiler = "none"
     sources = [source_text(file) for file in (block.SOURCE, compiled_network.SOURCE, Path(dense.__file__))]
-    parts = [processor(), torch.__version__, compiler, torch.get_num_threads(), precision, width, training, *sources]
+    vectors = torch.backends.cpu.get_cpu_capability()
+    parts = [processor(), vectors, torch.__version__, compiler, torch.get_num_threads(), precision, width, training, *sources]
     return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
 
 

@@ -170,9 +170,9 @@ class MeshGraphNet(nn.Module):
 
     def use_kernels(self, name: str) -> None:
         """``torch`` computes by torch's operations, ``compiled`` by kernels that are compiled here, once per user: the same
-        function, faster, on a CPU with AVX-512 and a C++ compiler. ``fused`` takes every pass of an inference in one call, on
-        any CPU with a compiler; gradients go by torch's operations. Parts of an own class are computed by torch's operations
-        and their own, with ``compiled`` beside the others; ``fused`` knows no such network.
+        function, faster, on a CPU with AVX2 or AVX-512 and a C++ compiler. ``fused`` takes every pass of an inference in one
+        call, on any CPU with a compiler; gradients go by torch's operations. Parts of an own class are computed by torch's
+        operations and their own, with ``compiled`` beside the others; ``fused`` knows no such network.
 
         Raises:
             ValueError: no such choice, or it does not work here, or not for this network.

@@ -1,6 +1,9 @@
 """The compiled kernels against the plain blocks and the formulas, with their gradients; and who is refused them."""
 
 import copy
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -19,20 +22,20 @@ from hood.tensors.dense import whole_arrays
 WIDTH = 64
 
 
-def reason() -> str:
+def reason(precision: str) -> str:
     """Why this machine cannot have them; empty where it can."""
     try:
-        for precision in ("fp32", "bf16"):
-            block.check_kernels("compiled", precision, WIDTH)
+        block.check_kernels("compiled", precision, WIDTH)
     except ValueError as error:
         return str(error)
     return ""
 
 
-REASON = reason()
+REASON, REASON_HALF = reason("fp32"), reason("bf16")
 needs_compiler = pytest.mark.skipif(bool(REASON), reason=REASON)
+needs_half = pytest.mark.skipif(bool(REASON_HALF), reason=REASON_HALF)
 #: Bound on the results and on their gradients; in bfloat16 some units that are nearly zero are on the other side of a ReLU.
-BOUNDS = [(torch.float32, 1e-6, 2e-6), (torch.bfloat16, 0.01, 0.045)]
+BOUNDS = [(torch.float32, 1e-6, 2e-6), pytest.param(torch.bfloat16, 0.01, 0.045, marks=needs_half)]
 
 
 def hub_and_gaps() -> EdgeSet:
@@ -64,11 +67,43 @@ def formulas(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet) -> tuple[T
     return latent + message, torch.zeros_like(nodes).index_add(0, edges.local_receivers, message)
 
 
+@pytest.fixture
+def no_avx512(monkeypatch):
+    """A processor with AVX2, as torch finds it; what was built for it."""
+    built = []
+
+    def build(source, flags):
+        built.append(flags)
+        return native_build.build(source, flags)
+
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
+    monkeypatch.setattr(block, "build", build)
+    block.library.cache_clear()
+    yield built
+    block.library.cache_clear()
+
+
+needs_avx2 = pytest.mark.skipif(torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"), reason="no AVX2 here")
+
+
 @needs_compiler
 @pytest.mark.parametrize("width", [16, 32, 48, WIDTH, 96])
 @pytest.mark.parametrize("dtype, bound, bound_gradient", BOUNDS)
 def test_an_edge_update_and_its_gradients_are_the_formulas(dtype, bound, bound_gradient, width):
     """Widths have panels of one to four registers; those of a multiple of 32 are by AMX where the processor has it."""
+    check_edge_update(dtype, bound, bound_gradient, width)
+
+
+@needs_compiler
+@needs_avx2
+@pytest.mark.parametrize("width", [16, 32, 48, WIDTH, 128])
+def test_processors_without_avx512_have_the_same_edge_update(no_avx512, width):
+    check_edge_update(torch.float32, 1e-6, 2e-6, width)
+    assert [flag for flag in no_avx512[0] if flag.startswith(("-mavx", "-mfma"))] == ["-mavx2", "-mfma"]
+
+
+def check_edge_update(dtype, bound, bound_gradient, width):
+    """Results and gradients are the formulas'; nodes without an edge get zeros; without a gradient nothing changes."""
     mlp, edges = perceptron(3 * width, width), hub_and_gaps()
     nodes = torch.randn(len(edges.nodes) + 5, width).to(dtype)
     latent = torch.randn(edges.num_edges, width).to(dtype)
@@ -112,6 +147,20 @@ def test_a_result_that_nobody_uses_has_no_gradient(used):
 @pytest.mark.parametrize("dtype, bound, bound_gradient", BOUNDS)
 def test_the_layers_behind_the_first_are_the_plain_ones(dtype, bound, bound_gradient, residual, rows):
     """With more rows than a tile and fewer; a node's latent, the residual, is float32 in any case."""
+    check_tail(dtype, bound, bound_gradient, residual, rows)
+
+
+@needs_compiler
+@needs_avx2
+@pytest.mark.parametrize("rows", [1, 205])
+@pytest.mark.parametrize("residual", [None, torch.float32])
+def test_processors_without_avx512_have_the_same_layers(no_avx512, residual, rows):
+    check_tail(torch.float32, 1e-6, 2e-6, residual, rows)
+    assert len(no_avx512) == 1
+
+
+def check_tail(dtype, bound, bound_gradient, residual, rows):
+    """Results and gradients are the plain ones."""
     mlp = perceptron(8)
     hidden, weight = torch.randn(rows, WIDTH).to(dtype), torch.randn(rows, WIDTH).double()
     inputs = [hidden] if residual is None else [hidden, torch.randn(rows, WIDTH, dtype=residual)]
@@ -132,7 +181,7 @@ def test_the_layers_behind_the_first_are_the_plain_ones(dtype, bound, bound_grad
 
 
 @needs_compiler
-@pytest.mark.parametrize("precision, bound", [("fp32", 1e-5), ("bf16", 0.015)])
+@pytest.mark.parametrize("precision, bound", [("fp32", 1e-5), pytest.param("bf16", 0.015, marks=needs_half)])
 def test_a_network_by_compiled_kernels_is_the_plain_network(precision, bound):
     network, *inputs = make("2x(mesh+coarse0)", 16)
     plain = network(*inputs)
@@ -191,7 +240,7 @@ def fresh(tmp_path, monkeypatch):
     block.library.cache_clear()
 
 
-@needs_compiler
+@needs_half
 @pytest.mark.parametrize("rows", [1, 33, 205])
 def test_processors_without_amx_have_the_same_products_of_bfloat16(plain_processor, rows):
     mlp = perceptron(8)
@@ -239,9 +288,27 @@ def test_who_is_refused(fresh, monkeypatch):
         with pytest.raises(ValueError, match=r"kernels=compiled: no C\+\+ compiler: install g\+\+ .* or use kernels=torch"):
             network.use_kernels("compiled")
     assert network.kernels == "torch"
+    monkeypatch.setattr(block.platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
-    with pytest.raises(ValueError, match="need a processor with AVX-512; use kernels=torch"):
+    with pytest.raises(ValueError, match="precision=bf16 need a processor with AVX512_BF16; use kernels=torch"):
+        block.check_kernels("compiled", "bf16", WIDTH)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "DEFAULT")
+    with pytest.raises(ValueError, match="need a processor with AVX2 or AVX-512; use kernels=torch"):
         network.use_kernels("compiled")
+    monkeypatch.setattr(block.platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr(block, "build", lambda source, flags: flags)
+    assert not [flag for flag in block.library(WIDTH, False) if flag.startswith("-m")]
+
+
+@needs_compiler
+@needs_avx2
+def test_torch_says_which_vectors_are_used():
+    """A process that is told to find AVX2 alone compiles for it, whatever the processor has."""
+    words = "from hood.model.kernels import block; block.build = lambda source, flags: print(*flags); block.library(16, False)"
+    environment = {**os.environ, "ATEN_CPU_CAPABILITY": "avx2"}
+    said = subprocess.run([sys.executable, "-c", words], env=environment, capture_output=True, text=True, check=True).stdout
+    assert "-mavx2 -mfma" in said
+    assert "-mavx512f" not in said
 
 
 def test_a_compiler_that_fails_is_named(fresh, monkeypatch):
