@@ -71,6 +71,9 @@ class Desk:
                 if re.fullmatch(pattern, name):
                     made, target = make(name, words), where / _without_stars(name)
                     target.parent.mkdir(parents=True, exist_ok=True)
+                    if (made / target.name).is_file():  # with what lies beside it
+                        shutil.copytree(made, target.parent, dirs_exist_ok=True)
+                        continue
                     (shutil.copytree if made.is_dir() else shutil.copy)(made, target)
 
     def _once(self, name: str, make: Callable[[Path], object]) -> Path:

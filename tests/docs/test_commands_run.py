@@ -92,7 +92,7 @@ EXIT_CODES = {
 }
 #: Lines that wait for ``-m slow``, and which of the others are like them.
 SLOW = (
-    (r"^evaluate .*models=\[(?!runs/mine)", "rows of other models, as of a run, a network and the solver"),
+    (r"^evaluate .*models=\[(?!runs/(mine|fine15))(?!.*SMPL_)", "rows of other models, as of a run, a network and the solver"),
     (r"^fabric chiffon", "thirteen fabrics, as of two"),
     (r"^train .*weights=[B-E]/|^train model=edges .*weights=", "further stages of recipes, as the first two of one"),
     (r"^train model=ours trainer=paper", "the model and the settings of experiment=paper"),
@@ -207,7 +207,7 @@ def check_whole(line: str) -> None:
     command, *words = chosen(line)
     if command == "evaluate":
         for name in load_config(command, words).garments:
-            locate("garments", str(name))
+            locate("garments", re.sub(r"(\.pkl):.*", r"\1", str(name)))
     if command == "envelope":
         assert make_tasks(load_config(command, words))
     if command == "tradeoff":

@@ -46,7 +46,6 @@ _REASON = 300
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
-_REFINING = ("refine",)
 #: Keys that people look for under another word.
 _OTHER_WORDS = {
     "motion": ("sequence", "sequences"),
@@ -95,7 +94,7 @@ def named_today(words: Sequence[str], command: str = "rollout") -> tuple[str, ..
 def with_network(words: Sequence[str]) -> tuple[str, ...]:
     """The words of a rollout; ``stepper=network`` among them where it is left to ``auto`` and one is about a network alone."""
     said = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words}
-    means = any(key.split(".")[0] in (*NETWORK_KEYS, *_REFINING) for key in said) or said.get("step", "plain") != "plain"
+    means = any(key.split(".")[0] in (*NETWORK_KEYS, "refine") for key in said) or said.get("step", "plain") != "plain"
     return (*words, "stepper=network") if means and said.get("stepper", "auto") == "auto" else tuple(words)
 
 
@@ -335,8 +334,10 @@ def _check_key(override: Override, known: DictConfig) -> None:
         raise ConfigError(f"override {override.input_line!r}: keys are fixed; write key=value without '+' or '~'")
     key = override.key_or_group
     if OmegaConf.select(known, key, default=OmegaConf) is OmegaConf:
-        siblings = _siblings(known, key)
-        meant = next((name for name in _OTHER_WORDS.get(key, ()) if name in siblings), None)
+        siblings, words = _siblings(known, key), (key, *_OTHER_WORDS.get(key, ()))
+        groups = {name: node for name, node in known.items() if isinstance(node, DictConfig)}
+        deeper = [f"{name}.{word}" for word in words for name, node in groups.items() if word in node]
+        meant = next(iter([word for word in words if word in siblings] + deeper), None)
         raise ConfigError(unknown("key", key, siblings, meant))
 
 
