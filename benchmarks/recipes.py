@@ -8,7 +8,7 @@
     python benchmarks/recipes.py shipped                    # both again, told what the potential asks of single vertices
     python benchmarks/recipes.py heads                      # one pass that predicts positions, or edges to solve positions from
     python benchmarks/recipes.py forces                     # forces, and steps of all vertices together under them
-    python benchmarks/recipes.py paper_head                 # the paper's own model with one choice of its training changed at a time
+    python benchmarks/recipes.py paper_head                 # the paper's own model, one choice of its training changed
 
 Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
 of that process, so that a busy machine changes nothing. Every finished run is evaluated by ``hood evaluate`` on motions it
