@@ -22,7 +22,7 @@ from hood.app.plan_file import plan_accuracy, plan_mode, plan_path, planned, rol
 from hood.app.scene.motion import NAMED, Own
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.python_words import overrides
-from hood.app.settings.tables import measurement
+from hood.app.settings.rollout_settings import measurement
 from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.app.stepping.guarding import GuardStopped, make_guard

@@ -18,7 +18,8 @@ from reference_oracle import make_state
 
 import hood
 from hood import api
-from hood.app.settings.compose import ConfigError, load_config, plain
+from hood.app.settings.compose import ConfigError, plain
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.guarding import GuardStopped
 from hood.assets.garment.garment import checked_garment
 from hood.steppers.newton import NewtonStepper
@@ -222,7 +223,7 @@ ODD = (
 def test_any_text_reaches_the_config_as_it_is(text: str) -> None:
     try:
         words = api.overrides({"output": text})
-        config = load_config("rollout", words)
+        config = RolloutSettings.from_words(words)
     except ConfigError:
         assert "${" in text  # an interpolation is no text
         return
@@ -271,7 +272,7 @@ def test_tables_reach_the_config() -> None:
     words = api.overrides({"size": {"sleeves": 1.2}, "fabrics": {"above_waistband": {"material": "silk", "friction": 2}}})
     assert words == ["size={sleeves:1.2}", "fabrics={above_waistband:{material:silk,friction:2}}"]
     events = [{"time": 0.5, "open": "front_buttons"}]
-    config = load_config("rollout", [*words, *api.overrides({"events": events})])
+    config = RolloutSettings.from_words([*words, *api.overrides({"events": events})])
     assert plain(config.size) == {"sleeves": 1.2}
     assert plain(config.fabrics) == {"above_waistband": {"material": "silk", "friction": 2}}
     assert plain(config.events) == events

@@ -11,7 +11,8 @@ import pytest
 
 import hood
 from hood import plugins
-from hood.app.settings.compose import ConfigError, build, load_config, options
+from hood.app.settings.compose import ConfigError, build, options
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.cli.main import main
 
 WIND = '''
@@ -95,9 +96,9 @@ def test_its_energy_is_in_the_file_and_its_options_in_the_help(place: Path, caps
 
 def test_a_fabric_from_outside_is_an_option(place: Path) -> None:
     install(place, "windy_cloth", registered=True)
-    assert build(load_config("rollout", ["material=felt"]).material).density == 0.7
+    assert build(RolloutSettings.from_words(["material=felt"]).material).density == 0.7
     with pytest.raises(ConfigError, match="did you mean 'felt'"):
-        load_config("rollout", ["material=fellt"])
+        RolloutSettings.from_words(["material=fellt"])
 
 
 def test_a_package_that_is_not_registered_is_not_built(place: Path) -> None:

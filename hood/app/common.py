@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -13,11 +12,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from hydra.utils import get_object
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, brief, load_config, plain, require_choice, shown
-from hood.app.settings.record import read_record
+from hood.app.settings.compose import ConfigError, brief, load_config, plain, require_choice
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install, say
 from hood.model.kernels.block import check_kernels, why_slow
@@ -76,7 +74,7 @@ def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], Dict
     return given, load_config(command, overrides)
 
 
-def frame_count(config: DictConfig) -> int | None:
+def frame_count(config: Settings) -> int | None:
     """``config.num_frames`` of a command that shows frames of a rollout: the first so many; None: all.
 
     Raises:
@@ -88,7 +86,7 @@ def frame_count(config: DictConfig) -> int | None:
     return None if count is None else int(count)
 
 
-def video_of(config: DictConfig) -> tuple[str, int]:
+def video_of(config: Settings) -> tuple[str, int]:
     """What ``video`` of a rollout says: mp4, gif or none, and of how many frames one is drawn.
 
     Raises:
@@ -103,7 +101,7 @@ def video_of(config: DictConfig) -> tuple[str, int]:
     return str(value[0]), value[1]
 
 
-def output_folder(config: DictConfig) -> Path:
+def output_folder(config: Settings) -> Path:
     """The folder that ``config.output`` names; nothing is made yet.
 
     Raises:
@@ -127,7 +125,7 @@ def require_distinct(key: str, values: Sequence[Any]) -> None:
         raise ConfigError(f"{key}: {twice!r} is given twice; leave one out")
 
 
-def thinning(config: DictConfig) -> float:
+def thinning(config: Settings) -> float:
     """[m] of ``config.thin_body``, which is in millimetres.
 
     Raises:
@@ -157,7 +155,7 @@ def prepare_folder(folder: Path) -> Path:
 
 
 @contextmanager
-def held_folder(config: DictConfig) -> Iterator[Path]:
+def held_folder(config: Settings) -> Iterator[Path]:
     """The output folder, made, checked, and held for this run by the first of its processes
     (:mod:`hood.assets.files.atomic`).
 
@@ -200,12 +198,12 @@ def require_same_model(
         raise ConfigError(f"{path}: holds a model of {named}, not the model asked for; {way_out}")
 
 
-def weigh(stepper: Stepper, config: DictConfig) -> None:
+def weigh(stepper: Stepper, config: Settings) -> None:
     """Let ``config.gravity`` [m/s²] act in the stepper's steps, on ``config.device``."""
     stepper.gravity = torch.tensor([0.0, -float(config.gravity), 0.0], device=str(config.device))
 
 
-def use_arithmetic(simulator: NetworkStepper, config: DictConfig, traced: bool = False) -> None:
+def use_arithmetic(simulator: NetworkStepper, config: Settings, traced: bool = False) -> None:
     """Let the simulator's network compute as ``config.precision`` and ``config.kernels`` say; a choice is told in one line.
 
     A step that is ``traced`` is torch's operations, which leaves no choice.
@@ -242,57 +240,7 @@ def tell_choice(choice: KernelChoice) -> None:
         say(choice)
 
 
-def require_same_config(config: DictConfig, folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:
-    """Raise ConfigError where the run in ``folder`` was started with other settings.
-
-    Keys in ``free`` may differ, and so may keys in ``free_below`` of the groups.
-    """
-    record = folder / "config.yaml"
-    if not record.exists():
-        return
-    before = read_record(record)
-
-    for key in map(str, config):
-        if key in free:
-            continue
-        there, here = plain(before.get(key)), plain(config[key])
-        if isinstance(there, dict) and isinstance(here, dict):
-            here = _as_known(there, here)
-            # A key that is newer than the record is null where nobody asks for anything.
-            there, here = (
-                {name: item for name, item in side.items() if name not in free_below and item is not None}
-                for side in (there, here)
-            )
-        if there != here:
-            name, there, here = _difference(key, there, here)
-            raise ConfigError(
-                f"{record}: {name} is {shown(there)} there, {shown(here)} in this command; resume with the same settings or "
-                "use another output"
-            )
-
-
-def _as_known(there: dict[str, Any], here: dict[str, Any]) -> dict[str, Any]:
-    """``here`` without the keys that are newer than the record and ask for nothing: off, or what their class does anyway."""
-    parameters = inspect.signature(get_object(here["_target_"])).parameters if "_target_" in here else {}
-    kept = {}
-    for key, value in here.items():
-        if key in there:
-            kept[key] = _as_known(there[key], value) if isinstance(value, dict) and isinstance(there[key], dict) else value
-        elif value is not None and value != (parameters[key].default if key in parameters else type(value)()):
-            kept[key] = value
-    return kept
-
-
-def _difference(name: str, there: Any, here: Any) -> tuple[str, Any, Any]:
-    """The first place in two values of a config that is not the same in both: its name, and what is there."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in dict.fromkeys([*there, *here]):
-            if there.get(key) != here.get(key):
-                return _difference(f"{name}.{key}", there.get(key), here.get(key))
-    return name, there, here
-
-
-def require_device(config: DictConfig) -> None:
+def require_device(config: Settings) -> None:
     """Raise ConfigError unless ``config.device`` is known and present."""
     require_choice(config, "device", ("cpu", "cuda"))
     if str(config.device) == "cuda" and not torch.cuda.is_available():

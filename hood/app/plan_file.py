@@ -19,11 +19,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from omegaconf import DictConfig
 
 from hood import plugins
 from hood.app.settings.compose import ConfigError, load_config, named_today
-from hood.app.settings.tables import refinement
+from hood.app.settings.rollout_settings import RolloutSettings, refinement
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import locate
@@ -131,14 +130,14 @@ def planned(overrides: Sequence[str]) -> list[str]:
     return words
 
 
-def rollout_config(overrides: Sequence[str]) -> DictConfig:
+def rollout_config(overrides: Sequence[str]) -> RolloutSettings:
     """The config of ``hood rollout`` with these words, those of a ``plan=FILE`` among them.
 
     Raises:
         ConfigError: unknown keys or values, a file that is no plan, or a word that the plan was not made for.
     """
     overrides = named_today(overrides)
-    config = load_config("rollout", overrides)
+    config = RolloutSettings.from_words(overrides)
     path = plan_path(config)
     if path is None:
         return config
@@ -152,7 +151,7 @@ def rollout_config(overrides: Sequence[str]) -> DictConfig:
         raise ConfigError(f"{key}={value}: {path} was made for {made}; drop {key}=…, or make a plan with hood plan {word}")
     given = {word.partition("=")[0] for word in overrides}
     try:
-        return load_config("rollout", [*(word for key, word in said.items() if key not in given), *overrides])
+        return RolloutSettings.from_words([*(word for key, word in said.items() if key not in given), *overrides])
     except ConfigError as error:  # what stands beside the plan has been read before
         raise ConfigError(f"plan={path}: {error}; make the plan again") from error
 

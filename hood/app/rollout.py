@@ -11,7 +11,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
 from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
@@ -25,7 +24,7 @@ from hood.app.scene.events import describe_held, fastening_attributes, summarise
 from hood.app.scene.garments import describe_ease, summarise_ease
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
-from hood.app.settings.tables import measurement
+from hood.app.settings.rollout_settings import RolloutSettings, measurement
 from hood.app.setup import Setup, check_config, make_stepper, set_up, solves_in_double, start_of
 from hood.app.stepping.automatic import advice
 from hood.app.stepping.cautions import idle_in_rollout, warn
@@ -58,7 +57,7 @@ class Rollouts:
         notes: what was said meanwhile, a line each.
     """
 
-    config: DictConfig
+    config: RolloutSettings
     summaries: tuple[dict[str, Any], ...]
     interrupted: bool
     notes: list[str]
@@ -89,7 +88,7 @@ def rollout(overrides: Sequence[str], bar: Bar = tell_how_far) -> Rollouts:
     return Rollouts(config, tuple(summaries), interrupted, notes)
 
 
-_Made = tuple[DictConfig, list[dict[str, Any]], bool]
+_Made = tuple[RolloutSettings, list[dict[str, Any]], bool]
 
 
 def _rollout(overrides: Sequence[str], bar: Bar) -> _Made:
@@ -101,7 +100,7 @@ def _rollout(overrides: Sequence[str], bar: Bar) -> _Made:
     return together(lambda: _run(rollout_config(distributed.on_main(lambda: planned(overrides))), bar))
 
 
-def _run(config: DictConfig, bar: Bar) -> _Made:
+def _run(config: RolloutSettings, bar: Bar) -> _Made:
     """One motion, or each of many in a folder of its own; processes that torchrun started share the many."""
     output = output_folder(config)
     jobs = distributed.on_main(lambda: find_jobs(str(config.sequence), output, config.root))
@@ -119,7 +118,9 @@ def _run(config: DictConfig, bar: Bar) -> _Made:
     return config, [summary], interrupted
 
 
-def _run_one(config: DictConfig, stepper: Stepper, digest: str, bar: Bar, alone: bool = True) -> tuple[dict[str, Any], bool]:
+def _run_one(
+    config: RolloutSettings, stepper: Stepper, digest: str, bar: Bar, alone: bool = True
+) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run
     none may replace another's, and none is the place for advice on the stepper."""
     with heard() as warned:
@@ -131,7 +132,7 @@ def _tell(sentences: Sequence[str]) -> None:
         say(sentence)
 
 
-def _keep_plan(config: DictConfig, folder: Path) -> None:
+def _keep_plan(config: RolloutSettings, folder: Path) -> None:
     """The plan beside what was made by it: the rollout can be made again when the plan's own place is gone."""
     path, here = plan_path(config), folder / "plan.json"
     if path is not None and path.resolve() != here.resolve():
@@ -145,7 +146,7 @@ def _first_positions(path: Path, count: int) -> np.ndarray:
 
 
 def _run_heard(
-    config: DictConfig, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool
+    config: RolloutSettings, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool
 ) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
@@ -157,7 +158,7 @@ def _run_heard(
 
 
 def _run_there(
-    ready: Setup, asked: DictConfig, digest: str, warned: Heard, bar: Bar, advise: bool
+    ready: Setup, asked: RolloutSettings, digest: str, warned: Heard, bar: Bar, advise: bool
 ) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held."""
     config, scene, stepper = ready.config, ready.scene, ready.stepper
@@ -196,7 +197,7 @@ def _run_there(
     return summary, interrupted
 
 
-def _run_all(config: DictConfig, jobs: list[Job], output: Path, bar: Bar) -> _Made:
+def _run_all(config: RolloutSettings, jobs: list[Job], output: Path, bar: Bar) -> _Made:
     """Every motion in its folder, and ``summary.json`` over all of them; one stepper for all."""
     config = distributed.on_main(lambda: with_one_stepper(config, jobs))
     stepper, digest = make_stepper(config)
@@ -219,7 +220,7 @@ def _run_all(config: DictConfig, jobs: list[Job], output: Path, bar: Bar) -> _Ma
 
 
 def _simulate_to_disk(
-    ready: Setup, digest: str, path: Path, asked: DictConfig, eases: list[Ease | None], doubts: Sequence[Doubt], bar: Bar
+    ready: Setup, digest: str, path: Path, asked: RolloutSettings, eases: list[Ease | None], doubts: Sequence[Doubt], bar: Bar
 ) -> bool:
     """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
     ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
@@ -313,7 +314,7 @@ def _simulate_to_disk(
     return False
 
 
-def _draw(config: DictConfig, folder: Path, bar: Bar) -> None:
+def _draw(config: RolloutSettings, folder: Path, bar: Bar) -> None:
     """Contact sheet and video, when the picture libraries are installed."""
     kind, stride = video_of(config)
     if kind == "none" and not bool(config.sheet):

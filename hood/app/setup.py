@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
 
 from hood.app.common import require_device, thinning, video_of
 from hood.app.notices import say
@@ -20,8 +19,8 @@ from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
 from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
-from hood.app.settings.compose import ConfigError, brief, load_config, require_choice
-from hood.app.settings.tables import measurement
+from hood.app.settings.compose import ConfigError, brief, require_choice
+from hood.app.settings.rollout_settings import RolloutSettings, measurement
 from hood.app.stepping.automatic import Choice, choose, decided
 from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
 from hood.app.stepping.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
@@ -48,7 +47,7 @@ from hood.tensors.precision import PRECISIONS, TF32
 class Setup:
     """What a rollout runs: ``config`` is the one asked for, with everything settled that it left to ``auto``."""
 
-    config: DictConfig
+    config: RolloutSettings
     scene: Scene
     stepper: Stepper
     choice: Choice
@@ -56,7 +55,7 @@ class Setup:
     own: Own = NAMED
 
 
-def check_config(config: DictConfig) -> None:
+def check_config(config: RolloutSettings) -> None:
     """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
     require_device(config)
     video_of(config)
@@ -77,7 +76,7 @@ def check_config(config: DictConfig) -> None:
     check_cloth_contact(config)
 
 
-def start_of(config: DictConfig) -> tuple[str, int]:
+def start_of(config: RolloutSettings) -> tuple[str, int]:
     """What ``settle`` says: one of :data:`hood.rollouts.frame.SETTLE_CHOICES`, and the number of relaxing steps.
 
     Raises:
@@ -95,7 +94,7 @@ def start_of(config: DictConfig) -> tuple[str, int]:
 
 
 def set_up(
-    config: DictConfig,
+    config: RolloutSettings,
     stepper: Stepper,
     own: Own = NAMED,
     tell: Callable[[str], None] = say,
@@ -137,19 +136,19 @@ def set_up(
     return Setup(settled, scene, stepper, choice, potential, own)
 
 
-def _watched(config: DictConfig, reduced: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
+def _watched(config: RolloutSettings, reduced: Stepper, scene: Scene, path: Path) -> tuple[Stepper, Potential]:
     """A plan's stepper with its watch, and the potential of the full model; what it has alone where the plan has no watch."""
     potential, watch = potential_of(config), read_watch(path)
     if watch is None:
         return reduced, potential
-    whole = load_config("rollout", watch.words)
+    whole = RolloutSettings.from_words(watch.words)
     check_config(whole)
     everything = potential_of(whole)
     full = refined(make_stepper(whole)[0], whole, scene.cloth.num_vertices, everything)
     return WatchedStepper(reduced, full, (potential, everything), scene, watch.limit, watch.hold), everything
 
 
-def make_scene(config: DictConfig, own: Own = NAMED) -> Scene:
+def make_scene(config: RolloutSettings, own: Own = NAMED) -> Scene:
     """Assets named in the config, or given, put together."""
     motion = make_motion(config, torch.float64 if solves_in_double(config) else torch.float32, own)
     given = config.garment if own.garment is None else own.garment
@@ -178,12 +177,12 @@ def _names_in(garment: Garment, files: list[str]) -> list[str]:
     return files if len(files) == count else garment.name.split("+")
 
 
-def solves_in_double(config: DictConfig) -> bool:
+def solves_in_double(config: RolloutSettings) -> bool:
     """Whether steps are judged in float64: then states are kept in it, rounded ones would not meet what is said of them."""
     return bool(config.solver.double) and (not option_of(config).network or chosen(config) is not None)
 
 
-def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
+def make_stepper(config: RolloutSettings) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     config, _ = decided(config)
     option, step = option_of(config), str(config.step)
@@ -192,7 +191,7 @@ def make_stepper(config: DictConfig) -> tuple[Stepper, str]:
     return make_solver(option, config, potential_of(config), step), "none"
 
 
-def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:
+def _check_start(config: RolloutSettings, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:
     """A line where a rollout has a start of its own."""
     if str(config.settle) != "equilibrium":
         return
@@ -201,7 +200,7 @@ def _check_start(config: DictConfig, stepper: Stepper, scene: Scene, tell: Calla
         tell(f"settle=paper: {reason}")
 
 
-def _check_metrics(config: DictConfig) -> None:
+def _check_metrics(config: RolloutSettings) -> None:
     asked = measurement(config)
     if asked.kind not in METRIC_CHOICES:
         raise ConfigError(unknown("metrics", asked.kind, METRIC_CHOICES))
@@ -209,7 +208,7 @@ def _check_metrics(config: DictConfig) -> None:
         raise ConfigError(f"metrics={brief(config.metrics)}: surface_every is {asked.surface_every}; it must be at least 1")
 
 
-def _check_numbers(config: DictConfig) -> None:
+def _check_numbers(config: RolloutSettings) -> None:
     for key, least in (("num_frames", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")

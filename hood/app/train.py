@@ -18,7 +18,6 @@ from hood.app.common import (
     load_stepper,
     output_folder,
     require_device,
-    require_same_config,
     require_same_model,
     tell_choice,
     together,
@@ -28,7 +27,7 @@ from hood.app.notices import collected, say
 from hood.app.scene.garments import as_simulated
 from hood.app.scene.motion import check_rate
 from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, shown
-from hood.app.settings.record import save_run_record
+from hood.app.settings.record import require_same_config, save_run_record
 from hood.app.stepping.cautions import idle_in_training
 from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown

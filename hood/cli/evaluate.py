@@ -25,12 +25,11 @@ from hood.app.common import (
     require_device,
     require_distinct,
     require_package,
-    require_same_config,
     together,
 )
 from hood.app.scene.garments import as_simulated, shape_coefficients
 from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice
-from hood.app.settings.record import save_run_record
+from hood.app.settings.record import require_same_config, save_run_record
 from hood.app.stepping.cautions import evaluation_cautions, warn
 from hood.assets.body.load import load_body
 from hood.assets.files.atomic import write_atomically

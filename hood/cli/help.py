@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from hood.app.settings.compose import CONFIG_FOLDER, headings, load_config, notes, options, plain, shown
+from hood.app.settings.compose import CONFIG_FOLDER, load_config, notes, options, plain, shown
 from hood.assets.files import library
 
 _EXAMPLES = {
@@ -91,7 +91,7 @@ _LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"materia
 def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
-    said, titles = notes(name), headings(name)
+    said, titles = notes(name), _headings(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
     for key in config:
@@ -156,3 +156,9 @@ def _leaves(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
 def _groups_of(name: str) -> list[str]:
     text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     return [match for match in re.findall(r"^\s+- (?:override )?/?(\w+):", text, flags=re.M) if match != "_self_"]
+
+
+def _headings(name: str) -> dict[str, str]:
+    """The lines ``#: …`` of ``configs/<name>.yaml``, by the key that follows each."""
+    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    return {key: title for title, key in re.findall(r"^#: (.*)\n(\w+):", text, flags=re.MULTILINE)}

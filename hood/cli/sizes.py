@@ -16,6 +16,7 @@ from hood.app.common import output_folder, prepare_folder, require_package
 from hood.app.scene.garments import FITS
 from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
 from hood.app.settings.python_words import overrides
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import check_config, make_stepper, set_up, start_of
 from hood.assets.files.atomic import write_atomically
 from hood.media.film import Film
@@ -98,14 +99,14 @@ def _shapes(config: DictConfig) -> list[tuple[float, ...]]:
     return [tuple(shape) for shape in shapes]
 
 
-def _rollout_config(config: DictConfig, size: Any, shape: tuple[float, ...]) -> DictConfig:
+def _rollout_config(config: DictConfig, size: Any, shape: tuple[float, ...]) -> RolloutSettings:
     """The rollout of one size on one body: nothing is measured on the way."""
     keys = {key: config[key] for key in _KEYS} | {"size": size, "betas": list(shape)}
     keys |= {"metrics": "none", "guard": "off", "video": "none"}
-    return load_config("rollout", overrides({key: plain(value) for key, value in keys.items()}))
+    return RolloutSettings.from_words(overrides({key: plain(value) for key, value in keys.items()}))
 
 
-def _wear(size: str, shape: tuple[float, ...], config: DictConfig, stepper: Stepper) -> _Worn:
+def _wear(size: str, shape: tuple[float, ...], config: RolloutSettings, stepper: Stepper) -> _Worn:
     """The garment after the frames of its rollout."""
     ready = set_up(config, stepper, tell=lambda sentence: None)
     scene, count = ready.scene, min(int(config.num_frames), ready.scene.num_frames)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from hood.app.scene.events import Asked, checked_events, describe_fasteners, describe_held
-from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.garment.garment import Garment, save_garment
 from hood.cli.main import main
 from hood.rollouts.file.reader import RolloutData, read_rollout
@@ -138,10 +139,10 @@ def test_a_late_event_is_warned_about() -> None:
 
 def test_events_of_a_config() -> None:
     words = ["events=[{time: 2, open: a}, {frame: 7, close: [a, b]}, {time: 0.5, attach: [3, hem]}]"]
-    assert checked_events(load_config("rollout", words)) == (
+    assert checked_events(RolloutSettings.from_words(words)) == (
         Asked(0, 2, False, "open", ("a",)), Asked(1, 7, True, "close", ("a", "b")), Asked(2, 0.5, False, "attach", (3, "hem"))
     )  # fmt: skip
-    assert checked_events(load_config("rollout")) == ()
+    assert checked_events(RolloutSettings.from_words([])) == ()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +164,7 @@ def test_events_of_a_config() -> None:
 )
 def test_what_is_no_event_names_its_place_and_the_fix(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        checked_events(load_config("rollout", words))
+        checked_events(RolloutSettings.from_words(words))
 
 
 @pytest.mark.parametrize(
@@ -200,4 +201,4 @@ def test_garments_without_fasteners_say_what_to_do(capsys: pytest.CaptureFixture
 
 def test_an_event_has_a_speed_of_its_own() -> None:
     words = ["events=[{time: 1, close: a, speed: 3}, {time: 2, close: a}]"]
-    assert [one.speed for one in checked_events(load_config("rollout", words))] == [3.0, SPEED]
+    assert [one.speed for one in checked_events(RolloutSettings.from_words(words))] == [3.0, SPEED]

@@ -9,7 +9,8 @@ import pytest
 
 from hood.app.notices import collected
 from hood.app.scene.motion import make_motion, motion_options
-from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.scene.body_motion.load import MotionOptions
 from hood.scene.body_motion.mesh_motion import MeshMotion, NoBody
 from hood.scene.body_motion.motion import BodyMotion
@@ -18,7 +19,7 @@ from hood.testing import sphere
 
 def test_defaults_of_the_config_are_those_of_the_code() -> None:
     """Written once in the code; the file repeats them where it explains them."""
-    assert motion_options(load_config("rollout")) == MotionOptions(parts=[])
+    assert motion_options(RolloutSettings.from_words([])) == MotionOptions(parts=[])
 
 
 def test_every_key_reaches_the_options() -> None:
@@ -30,11 +31,11 @@ def test_every_key_reaches_the_options() -> None:
         fps=25.0, up="y", file_fps=90.0, start="10f", stop=2.5, loop=3, blend_in=0.5, blend_from="a", betas=[1, -2.5],
         gender="male", hands="file", trans_unit="cm", scale=0.01, animation="Walk", parts=["Body", "Shoes"], num_frames=7,
     )  # fmt: skip
-    assert motion_options(load_config("rollout", words.split())) == expected
+    assert motion_options(RolloutSettings.from_words(words.split())) == expected
 
-    other = motion_options(load_config("rollout", ["unit=mm"]))
+    other = motion_options(RolloutSettings.from_words(["unit=mm"]))
     assert (other.trans_unit, other.scale) == ("mm", 0.001)
-    assert motion_options(load_config("rollout", ["unit=0.3048"])).scale == 0.3048
+    assert motion_options(RolloutSettings.from_words(["unit=0.3048"])).scale == 0.3048
 
 
 @pytest.mark.parametrize(
@@ -42,7 +43,7 @@ def test_every_key_reaches_the_options() -> None:
 )
 def test_values_of_the_wrong_kind_name_the_key(word: str) -> None:
     with pytest.raises(ConfigError, match=f"{word.split('=')[0]}="):
-        motion_options(load_config("rollout", [word]))
+        motion_options(RolloutSettings.from_words([word]))
 
 
 def test_what_is_not_performed_is_said(tmp_path: Path) -> None:
@@ -55,11 +56,11 @@ def test_what_is_not_performed_is_said(tmp_path: Path) -> None:
     }
     for body, (kind, words) in kinds.items():
         with collected() as said:
-            assert isinstance(make_motion(load_config("rollout", [f"body={body}"])), kind)
+            assert isinstance(make_motion(RolloutSettings.from_words([f"body={body}"])), kind)
         assert words in " ".join(said)
         assert bool(said) == bool(words)
     with collected() as said:
-        make_motion(load_config("rollout", ["body=none", "sequence=none"]))
+        make_motion(RolloutSettings.from_words(["body=none", "sequence=none"]))
     assert not said
 
 
@@ -68,4 +69,4 @@ def test_a_motion_file_that_is_not_performed_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "ball.npz", verts=points, faces=faces)
     for body, words in ((str(tmp_path / "ball.npz"), "performs its own motion"), ("none", "does not move")):
         with pytest.raises(ConfigError, match=rf"sequence=mine\.npz: body=\S+ {words}; leave sequence out"):
-            make_motion(load_config("rollout", [f"body={body}", "sequence=mine.npz"]))
+            make_motion(RolloutSettings.from_words([f"body={body}", "sequence=mine.npz"]))

@@ -11,7 +11,7 @@ from PIL import Image
 
 from hood import api
 from hood.app.scene.fabrics import fabric_named
-from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene
 from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.garment.parts import part_faces
@@ -51,7 +51,7 @@ def test_panels_go_from_the_file_into_the_scene(front: np.ndarray, capsys: pytes
     assert panels is not None
     np.testing.assert_array_equal(panels["front"], np.arange(len(front)) < front.sum())
     words = ["garment=top.npz", "fabrics={front:silk,back:denim}", "num_frames=2"]
-    density = make_scene(load_config("rollout", words)).cloth.density.numpy()
+    density = make_scene(RolloutSettings.from_words(words)).cloth.density.numpy()
     np.testing.assert_allclose(density[panels["front"]], fabric_named("silk").density, rtol=1e-6)
     np.testing.assert_allclose(density[panels["back"]], fabric_named("denim").density, rtol=1e-6)
 
@@ -71,11 +71,11 @@ def test_panels_are_known_by_the_name_in_the_file_and_by_the_listed_one(
         ["fabrics={Schoesschen:silk}"],
         api.overrides({"fabrics": {"Schößchen": "silk"}}),
     ):
-        config = load_config("rollout", ["garment=Jäckchen.npz", *words, "num_frames=2"])
+        config = RolloutSettings.from_words(["garment=Jäckchen.npz", *words, "num_frames=2"])
         np.testing.assert_allclose(make_scene(config).cloth.density.numpy(), np.where(before, silk, base), rtol=1e-6)
-    longer = load_config("rollout", ["garment=Jäckchen.npz", "size={Schößchen:1.1}", "num_frames=2"])
+    longer = RolloutSettings.from_words(["garment=Jäckchen.npz", "size={Schößchen:1.1}", "num_frames=2"])
     assert make_scene(longer).cloth.rest_area.sum() > make_scene(config).cloth.rest_area.sum()
-    whole = load_config("rollout", ["garment=[Jäckchen.npz,skirt]", "fabrics={Jäckchen:silk}", "num_frames=2"])
+    whole = RolloutSettings.from_words(["garment=[Jäckchen.npz,skirt]", "fabrics={Jäckchen:silk}", "num_frames=2"])
     density = make_scene(whole).cloth.density.numpy()
     np.testing.assert_allclose(density[: len(front)], silk, rtol=1e-6)
     np.testing.assert_allclose(density[len(front) :], base, rtol=1e-6)
@@ -109,8 +109,10 @@ def test_an_image_gives_faces_their_fabric(garments: dict[str, Garment]) -> None
     pixels[:, : int(1000 * middle)] = [255, 0, 0]
     Image.fromarray(pixels).save("map.png")
     red = dress.uv[dress.uv_faces].mean(axis=1)[:, 0] < int(1000 * middle) / 1000
-    density = make_scene(load_config("rollout", ["garment=dress", "fabrics={red@map.png:denim}", "num_frames=2"])).cloth.density
-    plain = make_scene(load_config("rollout", ["garment=dress", "num_frames=2"])).cloth.density
+    density = make_scene(
+        RolloutSettings.from_words(["garment=dress", "fabrics={red@map.png:denim}", "num_frames=2"])
+    ).cloth.density
+    plain = make_scene(RolloutSettings.from_words(["garment=dress", "num_frames=2"])).cloth.density
     np.testing.assert_allclose(density.numpy()[red], fabric_named("denim").density, rtol=1e-6)
     np.testing.assert_array_equal(density.numpy()[~red], plain.numpy()[~red])
     assert 0.2 < red.mean() < 0.8

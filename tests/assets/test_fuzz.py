@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from hood.app.common import require_same_config
 from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.record import require_same_config
 from hood.assets.identify import identify
 from hood.rollouts.file.reader import read_rollout
 

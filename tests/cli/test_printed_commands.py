@@ -10,6 +10,7 @@ import pytest
 from workshop import write_obj
 
 from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.cli.main import main
@@ -39,7 +40,7 @@ def test_the_repair_and_the_rollout_run(name: str, garments: dict[str, Garment],
     assert main(printed(repair, "repair: ")) == 0
     command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
     assert command == "rollout"
-    assert load_config("rollout", words).garment == f"{Path(name).stem}_prepared.npz"
+    assert RolloutSettings.from_words(words).garment == f"{Path(name).stem}_prepared.npz"
     assert main(
         [command, *words, "stepper=guess", "refine=0", "num_frames=1", "video=none", "sheet=false", "metrics=none"]
     ) in (0, 3)

@@ -10,6 +10,7 @@ import torch
 from coded_energies import TRANSCRIPTION, Case, collision, stretching
 
 from hood.app.settings.compose import build, load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
@@ -116,7 +117,7 @@ def test_a_shirt_is_held_all_over(garments: dict[str, Garment], body: Body, walk
 @pytest.mark.parametrize("lagged", [False, True])
 def test_configured_and_built_in_are_the_same(lagged: bool) -> None:
     words = ["losses=reference_as_coded", f"losses.terms.collision.lagged={str(lagged).lower()}"]
-    configured, built_in = build(load_config("rollout", words).losses), coded_potential(collision_lagged=lagged)
+    configured, built_in = build(RolloutSettings.from_words(words).losses), coded_potential(collision_lagged=lagged)
     assert configured.terms.keys() == built_in.terms.keys()
     for name, term in built_in.terms.items():
         assert type(configured.terms[name]) is type(term)

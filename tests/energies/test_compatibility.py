@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hood.app.settings.compose import build, load_config
+from hood.app.settings.compose import build
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle
@@ -47,7 +48,7 @@ def slope_body(angle, motion=(0.0, 0.0, 0.0)):
 
 
 def test_configured_and_built_in_are_the_same():
-    configured, built_in = build(load_config("rollout", ["losses=reference"]).losses), reference_potential()
+    configured, built_in = build(RolloutSettings.from_words(["losses=reference"]).losses), reference_potential()
     assert configured.terms.keys() == built_in.terms.keys()
     for name, term in built_in.terms.items():
         assert type(configured.terms[name]) is type(term)

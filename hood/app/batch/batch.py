@@ -15,11 +15,10 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from hood.app.batch.folders import as_begun, place_motions, refuse_others
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene, make_stepper
 from hood.app.stepping.automatic import AUTO, choose, decided
 from hood.app.stepping.steppers import with_stepper
@@ -104,11 +103,9 @@ class Job:
     sequence: str
     folder: Path
 
-    def of(self, config: DictConfig) -> DictConfig:
+    def of(self, config: RolloutSettings) -> RolloutSettings:
         """The config of its rollout, from that of all."""
-        one = OmegaConf.merge(config, {"sequence": self.sequence, "output": str(self.folder)})
-        assert isinstance(one, DictConfig)
-        return one
+        return config.with_values(sequence=self.sequence, output=str(self.folder))
 
 
 @dataclass
@@ -184,7 +181,7 @@ def share(jobs: Sequence[Job], work: Callable[[Job], tuple[dict[str, Any], bool]
     )
 
 
-def with_one_stepper(config: DictConfig, jobs: Sequence[Job]) -> DictConfig:
+def with_one_stepper(config: RolloutSettings, jobs: Sequence[Job]) -> RolloutSettings:
     """The config without ``stepper=auto``, and a line that says why.
 
     It is the stepper of the rollouts that are finished already where ``resume=true``, else what is chosen for the first motion.

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from omegaconf import DictConfig, OmegaConf
 
 from hood.app.common import output_folder
 from hood.app.notices import say
 from hood.app.output.summary import summarise
 from hood.app.settings.compose import ConfigError, brief, load_config, options, plain
 from hood.app.settings.record import read_settings
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.automatic import AUTO
 from hood.app.stepping.steppers import GROUP, with_stepper
 from hood.assets.files.library import locate, names
@@ -133,7 +133,7 @@ def _asked(attributes: Mapping[str, Any]) -> str:
 _FREE = ("resume", "output", "root", "fail_on", "sequence")
 
 
-def as_begun(config: DictConfig, motions: Iterable[tuple[str, Path]]) -> DictConfig:
+def as_begun(config: RolloutSettings, motions: Iterable[tuple[str, Path]]) -> RolloutSettings:
     """With ``resume=true stepper=auto`` the config with the stepper of the first rollout that is finished with all its other
     settings: what was begun with one stepper, or when another was the default, goes on with that.
 
@@ -147,13 +147,13 @@ def as_begun(config: DictConfig, motions: Iterable[tuple[str, Path]]) -> DictCon
         if attributes is None or str(attributes["stepper"]) not in options(GROUP):  # of a plugin that is gone
             continue
         same = with_stepper(config, str(attributes["stepper"]))
-        if not _other_settings(OmegaConf.merge(same, {"sequence": sequence}), attributes):
+        if not _other_settings(same.with_values(sequence=sequence), attributes):
             say(f"resume=true: stepper={same.stepper}, as in {folder}")
             return same
     return config
 
 
-def resumed(config: DictConfig, digest: str) -> dict[str, Any] | None:
+def resumed(config: RolloutSettings, digest: str) -> dict[str, Any] | None:
     """With ``resume=true`` the summary of the rollout that is in its folder; says where one there was made otherwise."""
     if not bool(config.resume):
         return None
@@ -165,7 +165,7 @@ def resumed(config: DictConfig, digest: str) -> dict[str, Any] | None:
     return done
 
 
-def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | None:
+def finished(config: RolloutSettings, digest: str, folder: Path) -> dict[str, Any] | None:
     """The summary of a rollout that was finished with the same settings and weights; None where there is none."""
     attributes = _complete(folder)
     try:
@@ -177,7 +177,7 @@ def finished(config: DictConfig, digest: str, folder: Path) -> dict[str, Any] | 
     return summary if {"sound", "doubts"} <= set(summary) else summarise(folder / "rollout.h5")
 
 
-def made_otherwise(config: DictConfig, folder: Path) -> str | None:
+def made_otherwise(config: RolloutSettings, folder: Path) -> str | None:
     """A sentence where the folder has a whole rollout of the motion with another setting; None where it has none."""
     attributes = _complete(folder)
     found = {} if attributes is None else _other_settings(config, attributes)

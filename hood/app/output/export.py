@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 
 from hood.app.common import frame_count, split_words
 from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import install
@@ -63,7 +64,7 @@ def export(arguments: Sequence[str]) -> tuple[Path, list[str]]:
     return target, said
 
 
-def check_outputs(config: DictConfig) -> None:
+def check_outputs(config: Settings) -> None:
     """Refuse formats of ``hood rollout formats=[…]`` that cannot be written, and images that nothing would show, before the
     first frame.
 
@@ -157,7 +158,7 @@ def _beside(source: Path, form: str) -> Path:
     return source.with_suffix(f".{form}") if form in _SUFFIXES else source.with_name(f"{source.stem}_{form}")
 
 
-def _target(config: DictConfig, source: Path, form: str) -> Path:
+def _target(config: Settings, source: Path, form: str) -> Path:
     """File or folder to write."""
     if config.output is None:
         target = _beside(source, form)
@@ -240,7 +241,7 @@ def read_checked(path: Path, colour: str) -> RolloutData:
 _NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "plan.json")
 
 
-def remove_earlier(folder: Path, config: DictConfig) -> None:
+def remove_earlier(folder: Path, config: Settings) -> None:
     """Remove summary, pictures, exports and plan of the rollout that was in ``folder``: they would pass for the next one's.
 
     The summary goes first: its presence says that everything is there. What ``config`` names as input stays.
@@ -264,7 +265,7 @@ def _words(value: Any) -> Iterator[str]:
 _EVERY = ""
 
 
-def read_textures(config: DictConfig) -> dict[str, Texture]:
+def read_textures(config: Settings) -> dict[str, Texture]:
     """The images that ``config.texture`` names, by garment; empty where it names none.
 
     Raises:

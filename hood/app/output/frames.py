@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
 
 from hood.app.scene.motion import NAMED, Own, is_blended, motion_options, perform
 from hood.app.settings.compose import ConfigError, shown
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.mesh.editing.subdivision import Subdivision
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, StepPlan
@@ -29,7 +29,7 @@ from hood.scene.scene import Scene
 _MOST_BETWEEN = 10
 
 
-def check_output_fps(config: DictConfig) -> None:
+def check_output_fps(config: RolloutSettings) -> None:
     """Raise ConfigError unless frames can be stored at ``output_fps``."""
     if config.output_fps is None:
         return
@@ -41,14 +41,16 @@ def check_output_fps(config: DictConfig) -> None:
         )
 
 
-def output_rate(config: DictConfig) -> OutputRate | None:
+def output_rate(config: RolloutSettings) -> OutputRate | None:
     """The rate of stored frames; None where these are the simulated ones."""
     if config.output_fps is None or float(config.output_fps) == float(config.fps):
         return None
     return OutputRate(float(config.output_fps), float(config.fps))
 
 
-def at_output_fps(frames: Iterable[Frame], config: DictConfig, scene: Scene, count: int, own: Own = NAMED) -> Iterator[Frame]:
+def at_output_fps(
+    frames: Iterable[Frame], config: RolloutSettings, scene: Scene, count: int, own: Own = NAMED
+) -> Iterator[Frame]:
     """The frames to store of ``count`` simulated ones: all of them where there is no ``output_fps``."""
     rate = output_rate(config)
     if rate is None:
@@ -58,7 +60,7 @@ def at_output_fps(frames: Iterable[Frame], config: DictConfig, scene: Scene, cou
     yield from output_frames(frames, rate, jumps, None if rate.whole else _posed(config, scene, rate.count(count), own))
 
 
-def planned_steps(config: DictConfig, scene: Scene, count: int) -> StepPlan | None:
+def planned_steps(config: RolloutSettings, scene: Scene, count: int) -> StepPlan | None:
     """What a file keeps of ``count`` simulated frames where it stores others; None where it does not."""
     rate = output_rate(config)
     return None if rate is None else StepPlan(rate, count, _watched(scene))
@@ -74,10 +76,10 @@ def _watched(scene: Scene) -> list[int]:
     return sorted(found)
 
 
-def _posed(config: DictConfig, scene: Scene, count: int, own: Own) -> Callable[[int], Tensor] | None:
+def _posed(config: RolloutSettings, scene: Scene, count: int, own: Own) -> Callable[[int], Tensor] | None:
     """The body at the moments of stored frames, posed by the motion itself; None where its parts are joined at simulated
     frames, so that another rate would move the joints: it is interpolated then, as the cloth is."""
-    if int(config.loop) != 1 or is_blended(config):
+    if config.output_fps is None or config.loop != 1 or is_blended(config):
         return None
     options = replace(motion_options(config), fps=float(config.output_fps), num_frames=count)
     with warnings.catch_warnings():
@@ -125,7 +127,7 @@ def describe_rate(summary: Mapping[str, Any]) -> list[str]:
 _LEVELS = 2
 
 
-def check_refine_mesh(config: DictConfig) -> None:
+def check_refine_mesh(config: RolloutSettings) -> None:
     """Raise ConfigError unless a mesh can be refined so often."""
     if not 0 <= int(config.refine_mesh) <= _LEVELS:
         raise ConfigError(
@@ -134,7 +136,7 @@ def check_refine_mesh(config: DictConfig) -> None:
         )
 
 
-def finer_mesh(config: DictConfig, scene: Scene) -> Subdivision | None:
+def finer_mesh(config: RolloutSettings, scene: Scene) -> Subdivision | None:
     """The mesh of stored frames; None where it is the simulated one."""
     if int(config.refine_mesh) == 0:
         return None

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
 
 from hood.app.settings.compose import ConfigError, plain
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.files.library import unknown
 from hood.assets.garment.pins import pin_mask
 from hood.rollouts.file.reader import RolloutData
@@ -176,7 +176,7 @@ class Asked:
         return int(self.moment) if self.in_frames else first_step(float(self.moment), dt)
 
 
-def checked_events(config: DictConfig) -> tuple[Asked, ...]:
+def checked_events(config: RolloutSettings) -> tuple[Asked, ...]:
     """The events that the config asks for, in its order.
 
     Raises:
@@ -235,7 +235,7 @@ def _names(where: str, action: str, given: Any) -> tuple[str | int, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def with_events(scene: Scene, config: DictConfig) -> Scene:
+def with_events(scene: Scene, config: RolloutSettings) -> Scene:
     """The scene with what is opened, closed, held and let go as the config asks; warns of events after the last frame.
 
     Raises:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from omegaconf import DictConfig
-
 from hood.app.settings.compose import ConfigError, build, load_config, options, plain
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import part_faces
@@ -18,7 +17,7 @@ from hood.scene.body_motion.motion import BodyMotion, Motion
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
 
 
-def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
+def fabric_of(config: Settings, garment: Garment, motion: Motion) -> Material:
     """The fabric that the config gives to ``garment``.
 
     Raises:
@@ -34,7 +33,7 @@ def fabric_of(config: DictConfig, garment: Garment, motion: Motion) -> Material:
     return patchwork(material, pieces, garment.rest_pos, garment.faces, width)
 
 
-def checked_fabrics(config: DictConfig) -> dict[str, Material]:
+def checked_fabrics(config: Settings) -> dict[str, Material]:
     """``fabrics`` of a config: fabrics by part.
 
     Raises:
@@ -51,7 +50,7 @@ def checked_fabrics(config: DictConfig) -> dict[str, Material]:
     return {str(part): _fabric(str(part), fabric, config) for part, fabric in value.items()}
 
 
-def checked_seams(config: DictConfig) -> float:
+def checked_seams(config: Settings) -> float:
     """``fabrics_seam`` of a config [m].
 
     Raises:
@@ -67,7 +66,7 @@ def checked_seams(config: DictConfig) -> float:
     return float(width)
 
 
-def _fabric(part: str, given: str | dict[str, Any], config: DictConfig) -> Material:
+def _fabric(part: str, given: str | dict[str, Any], config: Settings) -> Material:
     """The fabric of a part: an option of ``material=``, or a table of one and of properties instead of its own."""
     own = {} if isinstance(given, str) else {str(key): value for key, value in given.items()}
     name = given if isinstance(given, str) else own.pop("material", None)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, plain, require_choice
-from hood.app.settings.tables import objects
+from hood.app.settings.rollout_settings import Settings, objects
 from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.said import Doubt
 from hood.assets.fitting.suspicions import suspect_seams
@@ -92,7 +91,7 @@ def said(change: Mapping[str, Any], file: str) -> str:
 AUTO, NONE = "auto", "none"
 
 
-def wanted_of(config: DictConfig) -> Wanted:
+def wanted_of(config: Settings) -> Wanted:
     """What is asked of garments' files.
 
     Raises:

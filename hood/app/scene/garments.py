@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.scene.garment_files import read_garment
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.body.load import load_body
 from hood.assets.fitting.alterations import OPENING, SHORT, join_short_edges, part_open_seams, turn_flat_faces
 from hood.assets.fitting.placement import require_metres, used
@@ -191,7 +191,7 @@ _GROWING = 2.0
 FITS = ("betas", "none")
 
 
-def checked_sizes(config: DictConfig) -> Sizes:
+def checked_sizes(config: Settings) -> Sizes:
     """The sizes that the config asks for.
 
     Raises:
@@ -215,7 +215,7 @@ def checked_sizes(config: DictConfig) -> Sizes:
     return replace(sizes, to_measure=str(config.fit) == "betas")
 
 
-def _end_of(config: DictConfig) -> tuple[Any, float]:
+def _end_of(config: Settings) -> tuple[Any, float]:
     """What ``size_end`` says: the last size, None where it stays, and the seconds until then."""
     value = plain(config.size_end)
     if not isinstance(value, dict):
@@ -230,7 +230,7 @@ def _end_of(config: DictConfig) -> tuple[Any, float]:
     return value["size"], float(seconds)
 
 
-def checked_parts(config: DictConfig) -> dict[str, float]:
+def checked_parts(config: Settings) -> dict[str, float]:
     """Factors by part, where ``size`` is a table of them; empty where it is not.
 
     Raises:
@@ -247,7 +247,7 @@ def checked_parts(config: DictConfig) -> dict[str, float]:
     return {str(part): float(factor) for part, factor in value.items()}
 
 
-def cut_to_size(config: DictConfig, garment: Garment, motion: Motion) -> Garment:
+def cut_to_size(config: Settings, garment: Garment, motion: Motion) -> Garment:
     """``garment`` with its parts cut as the config asks for, if it does.
 
     Raises:

@@ -8,15 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
-from hood.app.settings.tables import objects
+from hood.app.settings.rollout_settings import Settings, objects
 from hood.assets.body.body import Body, body_part
 from hood.assets.files.library import names
 from hood.assets.garment.garment import Garment
@@ -48,7 +49,7 @@ class Own:
 NAMED = Own()
 
 
-def checked_friction(config: DictConfig) -> dict[str, float]:
+def checked_friction(config: Settings) -> dict[str, float]:
     """``body_friction`` of a config: factors on the coefficient of friction by part of the body.
 
     Raises:
@@ -65,7 +66,7 @@ def checked_friction(config: DictConfig) -> dict[str, float]:
     return {str(part): float(factor) for part, factor in value.items()}
 
 
-def with_body_friction(scene: Scene, config: DictConfig) -> Scene:
+def with_body_friction(scene: Scene, config: Settings) -> Scene:
     """The scene whose body grips as the config says; the same where it says nothing.
 
     Raises:
@@ -99,7 +100,7 @@ _WORDS = {
 }
 
 
-def check_motion_options(config: DictConfig) -> None:
+def check_motion_options(config: Settings) -> None:
     """Raise ConfigError where a key that says how a motion is performed has a value that none can have, used or not."""
     for key, known in _WORDS.items():
         if config[key] is not None:
@@ -112,14 +113,14 @@ def check_motion_options(config: DictConfig) -> None:
     check_rate(config)
 
 
-def check_rate(config: DictConfig, key: str = "fps") -> None:
+def check_rate(config: Settings, key: str = "fps") -> None:
     """Raise ConfigError unless a key is a frame rate at which steps can be taken."""
-    value = OmegaConf.select(config, key)
+    value: Any = reduce(getitem, key.split("."), config)
     if not 1.0 <= float(value) <= 1000.0:
         raise ConfigError(f"{key}={value}: give the simulation's frames per second, 1 to 1000")
 
 
-def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32, own: Own = NAMED) -> Motion:
+def make_motion(config: Settings, dtype: torch.dtype = torch.float32, own: Own = NAMED) -> Motion:
     """What moves in the scene, in ``dtype`` on the config's device.
 
     A body that performs no motion but its own does so beside an embedded motion, the default, and says that; a file was
@@ -142,14 +143,14 @@ def make_motion(config: DictConfig, dtype: torch.dtype = torch.float32, own: Own
     return perform(config, own, motion_options(config), dtype, str(config.device))
 
 
-def perform(config: DictConfig, own: Own, options: MotionOptions, dtype: torch.dtype, device: torch.device | str) -> Motion:
+def perform(config: Settings, own: Own, options: MotionOptions, dtype: torch.dtype, device: torch.device | str) -> Motion:
     """The body and the motion that the config names, or that are given, with these options."""
     body = str(config.body) if own.body is None else own.body
     sequence = str(config.sequence) if own.sequence is None else own.sequence
     return load_motion(body, sequence, options, dtype, device)
 
 
-def motion_options(config: DictConfig) -> MotionOptions:
+def motion_options(config: Settings) -> MotionOptions:
     """The keys of a config that say how a motion is performed.
 
     Raises:
@@ -176,12 +177,12 @@ def motion_options(config: DictConfig) -> MotionOptions:
     )
 
 
-def is_blended(config: DictConfig) -> bool:
+def is_blended(config: Settings) -> bool:
     """Whether the body moves into the motion from a standing pose."""
     return _blend(config)[0] != 0
 
 
-def _blend(config: DictConfig) -> tuple[float, str]:
+def _blend(config: Settings) -> tuple[float, str]:
     """What ``blend_in`` says: seconds, and the pose in which they begin."""
     value = plain(config.blend_in)
     seconds, pose = value if isinstance(value, list) and len(value) == 2 else (value, _POSES[0])
@@ -191,7 +192,7 @@ def _blend(config: DictConfig) -> tuple[float, str]:
     return float(seconds), str(pose)
 
 
-def _unit(config: DictConfig) -> tuple[str, float | None]:
+def _unit(config: Settings) -> tuple[str, float | None]:
     """What ``unit`` says: the name of the unit, "auto" where it says nothing, and its metres."""
     value = config.unit
     if value is None:
@@ -204,14 +205,14 @@ def _unit(config: DictConfig) -> tuple[str, float | None]:
     return next((name for name, metres in TRANSLATION_UNITS.items() if metres == value), f"{value:g}"), float(value)
 
 
-def _number(config: DictConfig, key: str) -> float:
+def _number(config: Settings, key: str) -> float:
     try:
         return float(config[key])
     except (TypeError, ValueError):
         raise ConfigError(f"{key}={shown(config[key])}: give a number, such as {key}={_SUCH_AS[key]}") from None
 
 
-def _optional(config: DictConfig, key: str) -> float | None:
+def _optional(config: Settings, key: str) -> float | None:
     return None if config[key] is None else _number(config, key)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.body.body import Body
 from hood.assets.fitting.fit_search import CLOSE, AskedFit, FoundFit, Resized, Wearer, find_placement
 from hood.assets.fitting.placement import UPWARD, Placement, find_scale, possible, size_ratio, used
@@ -23,7 +23,7 @@ _TURNS = (0, 90, 180, 270)
 _ANGLES = {"tpose": 0.0, "apose": A_POSE_ANGLE}
 
 
-def asked_keys(config: DictConfig) -> AskedFit:
+def asked_keys(config: Settings) -> AskedFit:
     """What ``scale``, ``up``, ``turn`` and ``offset`` of a config fix.
 
     Raises:

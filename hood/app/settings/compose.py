@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,9 @@ def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:
 
 def plain(node: Any) -> Any:
     """The node as dicts, lists and scalars."""
-    return OmegaConf.to_container(node, resolve=True) if isinstance(node, (DictConfig, ListConfig)) else node
+    if isinstance(node, (DictConfig, ListConfig)):
+        return OmegaConf.to_container(node, resolve=True)
+    return {key: plain(value) for key, value in node.items()} if isinstance(node, Mapping) else node
 
 
 def notes(name: str) -> dict[str, str]:
@@ -185,12 +188,6 @@ def notes(name: str) -> dict[str, str]:
             path = [] if group else [*path[: len(match.group(1)) // 2], match.group(3)]
             found[match.group(3) if group else ".".join(path)] = match.group(4) or ""
     return {key: note for key, note in found.items() if note}
-
-
-def headings(name: str) -> dict[str, str]:
-    """The lines ``#: …`` of ``configs/<name>.yaml``, by the key that follows each."""
-    text = (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
-    return {key: title for title, key in re.findall(r"^#: (.*)\n(\w+):", text, flags=re.MULTILINE)}
 
 
 def shown(value: Any) -> str:
@@ -223,9 +220,9 @@ def groups() -> list[str]:
     return sorted(path.name for path in CONFIG_FOLDER.iterdir() if path.is_dir())
 
 
-def require_choice(config: DictConfig, key: str, known: Sequence[str]) -> None:
+def require_choice(config: Mapping[Any, Any], key: str, known: Sequence[str]) -> None:
     """Raise ConfigError unless ``config[key]`` is one of ``known``; names the near miss."""
-    given = str(OmegaConf.select(config, key))
+    given = str(reduce(getitem, key.split("."), config))
     if given not in known:
         raise ConfigError(unknown(f"value for {key}", given, known))
 

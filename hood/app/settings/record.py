@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import platform
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
+from hydra.utils import get_object
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hood.app.settings.compose import _REASON, ConfigError, _one_line
+from hood.app.settings.compose import _REASON, ConfigError, _one_line, plain, shown
 from hood.app.settings.old_names import put_todays_keys, rename_targets
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
@@ -68,12 +71,12 @@ def _require_plain(text: str) -> None:
             raise ConfigError(f"it is nested more than {_DEEPEST} deep")
 
 
-def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
+def save_run_record(folder: Path, config: Mapping[Any, Any], seed: int) -> None:
     """Write ``config.yaml`` (resolved) and ``versions.json`` (packages, platform, seed) into a run folder."""
     from importlib.metadata import version
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True).encode())
+    write_atomically(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(plain(config))).encode())
     packages = {name: version(name) for name in ("torch", "numpy", "scipy", "h5py", "hydra-core", "safetensors")}
     from hood import __version__
 
@@ -85,3 +88,53 @@ def save_run_record(folder: Path, config: DictConfig, seed: int) -> None:
         "seed": seed,
     }
     write_atomically(folder / "versions.json", json.dumps(record, indent=1).encode())
+
+
+def require_same_config(config: Mapping[Any, Any], folder: Path, free: Sequence[str], free_below: Sequence[str] = ()) -> None:
+    """Raise ConfigError where the run in ``folder`` was started with other settings.
+
+    Keys in ``free`` may differ, and so may keys in ``free_below`` of the groups.
+    """
+    record = folder / "config.yaml"
+    if not record.exists():
+        return
+    before = read_record(record)
+
+    for key in map(str, config):
+        if key in free:
+            continue
+        there, here = plain(before.get(key)), plain(config[key])
+        if isinstance(there, dict) and isinstance(here, dict):
+            here = _as_known(there, here)
+            # A key that is newer than the record is null where nobody asks for anything.
+            there, here = (
+                {name: item for name, item in side.items() if name not in free_below and item is not None}
+                for side in (there, here)
+            )
+        if there != here:
+            name, there, here = _difference(key, there, here)
+            raise ConfigError(
+                f"{record}: {name} is {shown(there)} there, {shown(here)} in this command; resume with the same settings or "
+                "use another output"
+            )
+
+
+def _as_known(there: dict[str, Any], here: dict[str, Any]) -> dict[str, Any]:
+    """``here`` without the keys that are newer than the record and ask for nothing: off, or what their class does anyway."""
+    parameters = inspect.signature(get_object(here["_target_"])).parameters if "_target_" in here else {}
+    kept = {}
+    for key, value in here.items():
+        if key in there:
+            kept[key] = _as_known(there[key], value) if isinstance(value, dict) and isinstance(there[key], dict) else value
+        elif value is not None and value != (parameters[key].default if key in parameters else type(value)()):
+            kept[key] = value
+    return kept
+
+
+def _difference(name: str, there: Any, here: Any) -> tuple[str, Any, Any]:
+    """The first place in two values of a config that is not the same in both: its name, and what is there."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in dict.fromkeys([*there, *here]):
+            if there.get(key) != here.get(key):
+                return _difference(f"{name}.{key}", there.get(key), here.get(key))
+    return name, there, here

@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.settings.compose import plain
-from hood.app.settings.tables import refinement, with_value
+from hood.app.settings.rollout_settings import RolloutSettings, refinement, with_value
 from hood.app.stepping.cloth_contact import potential_of
 from hood.app.stepping.refinement import AUTO, refined
 from hood.app.stepping.steppers import losses_of, make_solver, option_of, with_stepper
@@ -49,15 +48,15 @@ class Choice:
     ms: dict[str, float] = field(default_factory=dict)
     why: list[str] = field(default_factory=list)
 
-    def settle(self, config: DictConfig) -> DictConfig:
+    def settle(self, config: RolloutSettings) -> RolloutSettings:
         """The config with these values in the place of ``auto``."""
         settled = with_stepper(config, self.stepper)
-        if self.refine is not None:
-            settled.refine = with_value(plain(config.refine), "goal", self.refine)
-        return settled
+        if self.refine is None:
+            return settled
+        return settled.with_values(refine=with_value(plain(config.refine), "goal", self.refine))
 
 
-def decided(config: DictConfig) -> tuple[DictConfig, list[str]]:
+def decided(config: RolloutSettings) -> tuple[RolloutSettings, list[str]]:
     """The config with the stepper that needs no measurement, and why; itself where ``auto`` has to measure, or is not asked."""
     if str(config.stepper) != AUTO or str(config.device) != "cpu":
         return config, []
@@ -65,7 +64,7 @@ def decided(config: DictConfig) -> tuple[DictConfig, list[str]]:
     return with_stepper(config, "newton"), [why]
 
 
-def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
+def choose(config: RolloutSettings, stepper: Stepper, scene: Scene) -> Choice:
     """What ``auto`` means for this scene, whose steps a network takes (``stepper``) unless the config names a solver."""
     asked = str(config.stepper)
     choice = Choice("network" if asked == AUTO else asked)
@@ -76,7 +75,7 @@ def choose(config: DictConfig, stepper: Stepper, scene: Scene) -> Choice:
     return choice
 
 
-def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.ndarray) -> list[str]:
+def advice(config: RolloutSettings, scene: Scene, summary: dict[str, Any], start: np.ndarray) -> list[str]:
     """After a rollout with a network: a sentence where the solver alone is faster here, and goes further down the potential.
 
     The solver is measured from the rollout's own ``start`` (V, 3) [m], world.
@@ -95,13 +94,13 @@ def advice(config: DictConfig, scene: Scene, summary: dict[str, Any], start: np.
     ]
 
 
-def solver(config: DictConfig) -> Stepper:
+def solver(config: RolloutSettings) -> Stepper:
     """The stepper of ``stepper=newton``."""
     alone = with_stepper(config, "newton")
     return make_solver(option_of(alone), alone, potential_of(alone))
 
 
-def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> int:
+def _iterations(config: RolloutSettings, stepper: Stepper, scene: Scene, choice: Choice) -> int:
     """Refinement that the garment's size needs: none where the weights know it, or do not say what they know."""
     network = network_of(stepper)
     if network is None or network.trained_for is None:
@@ -117,7 +116,7 @@ def _iterations(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choi
     return ITERATIONS
 
 
-def _compare(config: DictConfig, stepper: Stepper, scene: Scene, choice: Choice) -> None:
+def _compare(config: RolloutSettings, stepper: Stepper, scene: Scene, choice: Choice) -> None:
     """The network where a frame of it takes less time than one of the solver and leaves no more force; both are measured."""
     potential, size, scene = losses_of(config), scene.cloth.num_vertices, _put_on(scene)
     with_network = _measure(refined(stepper, choice.settle(config), size), scene, potential)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 
 from hood.app.settings.compose import NETWORK_KEYS, plain
-from hood.app.settings.tables import Measurement, cloth_contact, measurement
+from hood.app.settings.rollout_settings import Measurement, RolloutSettings, Settings, cloth_contact, measurement
 from hood.app.stepping.steppers import option_of
 from hood.energies.potential import Potential, default_potential
 from hood.energies.term import Form, Role, having, named
@@ -128,20 +128,20 @@ class _Rule(NamedTuple):
     """A key, when it acts, and what it waits for."""
 
     key: str
-    acts: Callable[[DictConfig], Any]
+    acts: Callable[[Any], Any]  # its settings
     why: str
 
 
-def _is_drawn(config: DictConfig) -> bool:
+def _is_drawn(config: RolloutSettings) -> bool:
     return str(config.video) != "none" or bool(config.sheet)
 
 
-def _is_measured_as_asked(config: DictConfig) -> bool:
+def _is_measured_as_asked(config: RolloutSettings) -> bool:
     asked = measurement(config)
     return asked.kind == "all" or asked.surface_every == Measurement().surface_every
 
 
-def _rubs_what_is_kept_apart(config: DictConfig) -> bool:
+def _rubs_what_is_kept_apart(config: RolloutSettings) -> bool:
     asked = cloth_contact(config)
     return asked.mode != "off" or asked.friction == 0
 
@@ -160,7 +160,7 @@ _TRAIN = (
 )
 
 
-def idle_in_rollout(words: Sequence[str], config: DictConfig) -> list[str]:
+def idle_in_rollout(words: Sequence[str], config: RolloutSettings) -> list[str]:
     """A line for each of the words of a rollout that does nothing; its config has them."""
     return [*_without_network(words, config), *_idle(_ROLLOUT, words, config)]
 
@@ -170,14 +170,14 @@ def idle_in_training(words: Sequence[str], config: DictConfig) -> list[str]:
     return list(_idle(_TRAIN, words, config))
 
 
-def _idle(rules: Sequence[_Rule], words: Sequence[str], config: DictConfig) -> Iterator[str]:
+def _idle(rules: Sequence[_Rule], words: Sequence[str], config: Settings) -> Iterator[str]:
     given = {word.partition("=")[0]: word for word in words}
     for rule in rules:
         if rule.key in given and not rule.acts(config):
             yield f"{given[rule.key]} has no effect: {rule.why}"
 
 
-def _without_network(words: Sequence[str], config: DictConfig) -> list[str]:
+def _without_network(words: Sequence[str], config: RolloutSettings) -> list[str]:
     """What is said of a network where none takes the steps."""
     given = [word for word in words if word.partition("=")[0].split(".")[0] in NETWORK_KEYS]
     if not given or option_of(config).network or plain(config.get("plan")) not in (None, "auto", "full"):

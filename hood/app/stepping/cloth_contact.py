@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain
-from hood.app.settings.tables import cloth_contact, refinement
+from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, refinement
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
 from hood.assets.files.library import unknown
@@ -26,7 +25,7 @@ from hood.solver.step_figures import LAYER_METRICS
 _CHOICES = ("auto", "on", "off", "layers")
 
 
-def check_cloth_contact(config: DictConfig) -> None:
+def check_cloth_contact(config: RolloutSettings) -> None:
     """Raise ConfigError where the key asks for what the other keys rule out."""
     mode, friction = cloth_contact(config)
     if mode not in _CHOICES:
@@ -41,7 +40,7 @@ def check_cloth_contact(config: DictConfig) -> None:
             raise ConfigError(f"cloth_contact={mode}: {reason}")
 
 
-def potential_of(config: DictConfig) -> Potential:
+def potential_of(config: RolloutSettings) -> Potential:
     """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
     rest of the settled config ask for them."""
     potential: Potential = losses_of(config)
@@ -52,7 +51,7 @@ def potential_of(config: DictConfig) -> Potential:
     return potential.with_terms(layer_friction=LayerFriction(float(asked.friction))) if asked.friction > 0 else potential
 
 
-def acts(config: DictConfig) -> bool:
+def acts(config: RolloutSettings) -> bool:
     """Whether layers of cloth are kept apart.
 
     Raises:
@@ -61,7 +60,7 @@ def acts(config: DictConfig) -> bool:
     return cloth_contact(config).mode != "off" and not why_not(config)
 
 
-def why_not(config: DictConfig) -> str:
+def why_not(config: RolloutSettings) -> str:
     """Why layers are not kept apart in the settled config, with the way out; empty where they are, or nobody asks.
 
     Raises:
@@ -70,7 +69,7 @@ def why_not(config: DictConfig) -> str:
     return _why_not(config)
 
 
-def _why_not(config: DictConfig, potential: Potential | None = None) -> str:
+def _why_not(config: RolloutSettings, potential: Potential | None = None) -> str:
     """The same, with the potential of the config's losses where it is known."""
     asked = cloth_contact(config).mode
     reason = "" if asked == "off" else _hindrance(config, potential)
@@ -79,7 +78,7 @@ def _why_not(config: DictConfig, potential: Potential | None = None) -> str:
     return reason
 
 
-def tell_if_off(config: DictConfig, garments: int) -> None:
+def tell_if_off(config: RolloutSettings, garments: int) -> None:
     """A line where contact that may be expected does not act: where the solver takes or refines the steps, and a warning where
     several garments start as they are, one through the other."""
     reason = why_not(config)
@@ -93,7 +92,7 @@ def tell_if_off(config: DictConfig, garments: int) -> None:
         say(f"cloth_contact=auto: off; {reason}")
 
 
-def _hindrance(config: DictConfig, potential: Potential | None = None) -> str:
+def _hindrance(config: RolloutSettings, potential: Potential | None = None) -> str:
     """Why layers cannot be kept apart in this rollout, with the way out; empty where they can. ``potential`` is that of the
     config's losses, where it is known."""
     if _rough(config):
@@ -123,7 +122,7 @@ def _are_published(terms: Mapping[str, Term]) -> bool:
     return not others and any(term.published for term in found)
 
 
-def _rough(config: DictConfig) -> bool:
+def _rough(config: RolloutSettings) -> bool:
     """Whether nobody refines steps that may be refined."""
     return option_of(config).refinement == MAY and chosen(config) is None
 

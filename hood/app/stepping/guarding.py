@@ -9,11 +9,10 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, build, require_choice
-from hood.app.settings.tables import measurement, refinement
+from hood.app.settings.rollout_settings import RolloutSettings, measurement, refinement
 from hood.energies.potential import Potential
 from hood.rollouts.checks.guard import (
     CHECK,
@@ -58,7 +57,7 @@ class GuardStopped(Exception):
     """``guard=strict`` has ended a rollout."""
 
 
-def check_guard(config: DictConfig) -> None:
+def check_guard(config: RolloutSettings) -> None:
     """Raise ConfigError where the guard cannot do what is asked for."""
     require_choice(config, "guard", MODES)
     mode, step = str(config.guard), str(config.step)
@@ -73,7 +72,7 @@ def check_guard(config: DictConfig) -> None:
         )
 
 
-def make_guard(config: DictConfig, stepper: Stepper, potential: Potential) -> Guard | None:
+def make_guard(config: RolloutSettings, stepper: Stepper, potential: Potential) -> Guard | None:
     """A guard for one rollout; None, with a line where that is not what was asked for, where there is none."""
     mode = str(config.guard)
     if mode == OFF:

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from omegaconf import DictConfig
 
 from hood.app.settings.compose import ConfigError, brief, build, require_choice
-from hood.app.settings.tables import Refinement, measurement, refinement
+from hood.app.settings.rollout_settings import Refinement, RolloutSettings, measurement, refinement
 from hood.app.stepping.steppers import ALWAYS, NEVER, losses_of, option_of
 from hood.assets.files.library import unknown
 from hood.energies.potential import Potential
@@ -79,7 +78,7 @@ def chosen(config: Mapping[Any, Any]) -> AskedRefinement | None:
     return AskedRefinement(goal, unit, f"refine={value}", how)
 
 
-def check_refinement(config: DictConfig) -> None:
+def check_refinement(config: RolloutSettings) -> None:
     """Raise ConfigError where what is said about refinement, export and colour does not fit together."""
     asked, how = chosen(config), refinement(config)
     if how.method not in METHODS:
@@ -105,7 +104,7 @@ def check_refinement(config: DictConfig) -> None:
     make_goal(config, num_vertices=1000)
 
 
-def exported(config: DictConfig) -> tuple[str, ...]:
+def exported(config: RolloutSettings) -> tuple[str, ...]:
     """Values of every vertex that go into the file: those asked for, and what pictures are coloured by.
 
     Raises:
@@ -120,7 +119,7 @@ def exported(config: DictConfig) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*names, *([drawn] if drawn in FIELD_CHOICES else [])]))
 
 
-def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None:
+def make_goal(config: RolloutSettings, num_vertices: int) -> StoppingCriterion | None:
     """A new goal for one rollout of a cloth of this size; None where nothing is refined.
 
     Raises:
@@ -144,7 +143,7 @@ def make_goal(config: DictConfig, num_vertices: int) -> StoppingCriterion | None
     )
 
 
-def refined(stepper: Stepper, config: DictConfig, num_vertices: int, potential: Potential | None = None) -> Stepper:
+def refined(stepper: Stepper, config: RolloutSettings, num_vertices: int, potential: Potential | None = None) -> Stepper:
     """The stepper with its steps refined as the config says, down ``potential`` (default: its losses): itself where it says
     nothing."""
     goal = make_goal(config, num_vertices)

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hood.app.common import UNTRAINED, load_stepper, require_same_model, use_arithmetic, weigh
 from hood.app.settings.compose import ConfigError, build, load_config, options, plain
+from hood.app.settings.rollout_settings import RolloutSettings, Settings
 from hood.assets.files.library import locate
 from hood.energies.potential import Potential
 from hood.plugins import config_folders
@@ -33,7 +33,7 @@ _REMEMBERED = 32
 _KNOWN: dict[str, Potential] = {}
 
 
-def losses_of(config: DictConfig) -> Potential:
+def losses_of(config: Settings) -> Potential:
     """The energies that ``config.losses`` names. Terms of this package hold nothing but settings, and are shared by potentials
     of the same content; those of other packages are made anew each time.
 
@@ -95,14 +95,9 @@ def option_of(config: Mapping[Any, Any]) -> StepperOption:
     return _option(str(name), keys)
 
 
-def with_stepper(config: DictConfig, name: str) -> DictConfig:
+def with_stepper(config: RolloutSettings, name: str) -> RolloutSettings:
     """A rollout's config with another option: the same where it is the one it has."""
-    same = OmegaConf.merge(config)
-    assert isinstance(same, DictConfig)
-    if str(config.stepper) != name:
-        with open_dict(same):
-            same.update(_content(name, config_folders()))
-    return same
+    return config if config.stepper == name else config.with_values(**_content(name, config_folders()))
 
 
 def find_option(name: str) -> StepperOption | None:
@@ -131,7 +126,7 @@ def _option(name: str, keys: Any) -> StepperOption:
     return StepperOption(name, bool(keys.get("network", False)), refinement, made_by)
 
 
-def make_solver(option: StepperOption, config: DictConfig, potential: Potential, step: str = PLAIN) -> Stepper:
+def make_solver(option: StepperOption, config: Settings, potential: Potential, step: str = PLAIN) -> Stepper:
     """The stepper of an option without a network, before it is refined, on the config's device.
 
     Args:
@@ -159,7 +154,7 @@ def make_solver(option: StepperOption, config: DictConfig, potential: Potential,
 
 
 def make_network(
-    config: DictConfig, checkpoint: str, model: Any = None, step: str = PLAIN, way_out: str = "drop model=… from the command"
+    config: Settings, checkpoint: str, model: Any = None, step: str = PLAIN, way_out: str = "drop model=… from the command"
 ) -> tuple[Stepper, str]:
     """A network's stepper, before it is refined, on the config's device, and the SHA-256 of its file.
 
@@ -190,7 +185,7 @@ def make_network(
     return (simulator if step == PLAIN else CapturedSimulator(simulator, step)), digest
 
 
-def _weigh(stepper: Stepper, config: DictConfig) -> None:
+def _weigh(stepper: Stepper, config: Settings) -> None:
     """The command's gravity, before anything is made of the stepper that reads it; the stepper's own where it has none."""
     if "gravity" in config:
         weigh(stepper, config)

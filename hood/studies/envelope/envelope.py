@@ -17,10 +17,10 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.app.common import held_folder, require_distinct, require_same_config, together
+from hood.app.common import held_folder, require_distinct, together
 from hood.app.output.verdict import surface_warnings
 from hood.app.settings.compose import ConfigError, load_config, shown
-from hood.app.settings.record import save_run_record
+from hood.app.settings.record import require_same_config, save_run_record
 from hood.assets.files.atomic import write_atomically
 from hood.evaluation.files import write_rows
 from hood.evaluation.table import NEWTON

@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from omegaconf import DictConfig
-
-from hood.app.settings.compose import plain, with_words
+from hood.app.settings.compose import plain
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import Setup, check_config, make_scene, make_stepper, solves_in_double
 from hood.app.stepping.cloth_contact import acts, potential_of
 from hood.app.stepping.refinement import refined
@@ -47,12 +46,12 @@ class PartChoice:
     finer: bool = False
 
 
-def choices_of(config: DictConfig) -> list[PartChoice]:
+def choices_of(config: RolloutSettings) -> list[PartChoice]:
     """Of a settled config of ``hood rollout``; the coarsest mesh first, finer ones last."""
     return [*_meshes(config), *_time_steps(config)]
 
 
-def choose_choices(config: DictConfig, asked: list[str]) -> list[PartChoice]:
+def choose_choices(config: RolloutSettings, asked: list[str]) -> list[PartChoice]:
     """Those of the names; where none is given all that are coarser, and the shorter time step."""
     there = choices_of(config)
     if asked:
@@ -60,13 +59,13 @@ def choose_choices(config: DictConfig, asked: list[str]) -> list[PartChoice]:
     return [one for one in there if not (one.finer and one.kind == MESH)]
 
 
-def scene_of(config: DictConfig, words: Sequence[str]) -> Scene:
+def scene_of(config: RolloutSettings, words: Sequence[str]) -> Scene:
     """The scene of a settled config with the words of choices.
 
     Raises:
         ConfigError, ValueError, FileNotFoundError: as for a rollout.
     """
-    other = with_words(config, words)
+    other = config.with_words(words)
     scene = make_scene(other)
     return with_held_layers_apart(scene) if acts(other) else scene
 
@@ -80,7 +79,7 @@ def levels_of(garment: str) -> dict[str, int]:
     return dict(sorted({stem: 1, **sizes}.items(), key=lambda pair: pair[1]))
 
 
-def _meshes(config: DictConfig) -> list[PartChoice]:
+def _meshes(config: RolloutSettings) -> list[PartChoice]:
     own = plain(config.garment)
     levels = levels_of(own) if isinstance(own, str) else {}
     if not levels or _by_vertices(config):
@@ -94,14 +93,14 @@ def _meshes(config: DictConfig) -> list[PartChoice]:
     return found
 
 
-def _by_vertices(config: DictConfig) -> bool:
+def _by_vertices(config: RolloutSettings) -> bool:
     """Whether the config names vertices, which are those of one mesh: pins and parts by number or list."""
     pins = plain(config.pins)
     given = [*(pins if isinstance(pins, list) else [pins]), *(plain(config.fabrics) or {})]
     return any(isinstance(one, int) or str(one).endswith((".txt", ".json")) for one in given if one is not None)
 
 
-def _time_steps(config: DictConfig) -> list[PartChoice]:
+def _time_steps(config: RolloutSettings) -> list[PartChoice]:
     """Twice and half as many steps; none for networks, which know the step of their training, and where frames are named."""
     if option_of(config).network or plain(config.events):
         return []
@@ -139,16 +138,16 @@ class Variants:
         return self.full if scene is self.full.scene else variant(self.config, scene)
 
 
-def settled_with(words: Sequence[str], config: DictConfig) -> DictConfig:
+def settled_with(words: Sequence[str], config: RolloutSettings) -> RolloutSettings:
     """A settled config with further settings, a stepper among them."""
     steppers = [word.partition("=")[2] for word in words if word.startswith("stepper=")]
     base = with_stepper(config, steppers[-1]) if steppers else config
-    config = with_words(base, [word for word in words if not word.startswith("stepper=")])
+    config = base.with_words([word for word in words if not word.startswith("stepper=")])
     check_config(config)
     return config
 
 
-def variant(config: DictConfig, scene: Scene) -> Variant:
+def variant(config: RolloutSettings, scene: Scene) -> Variant:
     """What a settled config says of the steps, in a scene whose cloth, body and motion are given."""
     potential, option = potential_of(config), option_of(config)
     stepper = make_stepper(config)[0] if option.network else make_solver(option, config, potential, str(config.step))

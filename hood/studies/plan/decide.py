@@ -34,8 +34,8 @@ class Tolerance:
     unit: str  # "gamma" or "mm"
 
     @classmethod
-    def read(cls, text: str) -> Tolerance:
-        """``0.01`` is of γ, ``5mm`` a distance.
+    def read(cls, text: str, key: str = "accuracy") -> Tolerance:
+        """``0.01`` is of γ, ``5mm`` a distance; ``key`` is what was given it.
 
         Raises:
             ValueError: neither; a γ above 1, which is a distance without its unit.
@@ -43,9 +43,9 @@ class Tolerance:
         match = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?)\s*(mm)?", str(text).strip())
         value = float(match.group(1)) if match and match.group(1).count(".") < 2 and match.group(1) != "." else 0.0
         if match is None or not 0.0 < value < math.inf:
-            raise ValueError(f"accuracy={text}: give a γ above 0 (0.01), or a distance (5mm)")
+            raise ValueError(f"{key}={text}: give a γ above 0 (0.01), or a distance (5mm)")
         if match.group(2) is None and value > 1.0:  # γ = 1 is the weight itself
-            raise ValueError(f"accuracy={text}: give accuracy=0.01 (a γ) or accuracy={text}mm (a distance)")
+            raise ValueError(f"{key}={text}: give {key}=0.01 (a γ) or {key}={text}mm (a distance)")
         return cls(value, "mm" if match.group(2) else "gamma")
 
     @property

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from omegaconf import DictConfig
-
 from hood.app.settings.compose import ConfigError, plain
 from hood.app.settings.python_words import overrides
-from hood.app.settings.tables import cloth_contact, with_value
+from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, with_value
 from hood.app.stepping.cloth_contact import acts
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import losses_of
@@ -47,42 +45,42 @@ class Part:
 _FROM_GUESS, _FROM_NETWORK = (8, 4, 2), (0, 5)
 
 
-def _has(name: str) -> Callable[[DictConfig], bool]:
+def _has(name: str) -> Callable[[RolloutSettings], bool]:
     return lambda config: config.losses.terms.get(name) is not None
 
 
-def _solver(config: DictConfig) -> bool:
+def _solver(config: RolloutSettings) -> bool:
     return str(config.stepper) == "newton"
 
 
-def _bulges(config: DictConfig) -> bool:
+def _bulges(config: RolloutSettings) -> bool:
     return _collision(config, "reach", "curvature")
 
 
-def _folds(config: DictConfig) -> bool:
+def _folds(config: RolloutSettings) -> bool:
     return _collision(config, "sides", "both")
 
 
-def _collision(config: DictConfig, key: str, value: str) -> bool:
+def _collision(config: RolloutSettings, key: str, value: str) -> bool:
     term = losses_of(config).terms.get("collision")
     return term is not None and role_of(term) is Role.CONTACT and getattr(term, key, None) == value
 
 
-def _iterations(config: DictConfig) -> int:
+def _iterations(config: RolloutSettings) -> int:
     """Iterations after the network, or from the guess; 0 where none are counted."""
     asked = None if _solver(config) else chosen(config)
     return int(asked.value) if asked is not None and not asked.unit else 0
 
 
-def _target(share: float) -> Callable[[DictConfig], bool]:
+def _target(share: float) -> Callable[[RolloutSettings], bool]:
     return lambda config: _solver(config) and float(config.solver.target_rg) < share
 
 
-def _given(key: str) -> Callable[[DictConfig], bool]:
+def _given(key: str) -> Callable[[RolloutSettings], bool]:
     return lambda config: config.get(key) is not None
 
 
-def _by_factors(config: DictConfig) -> bool:
+def _by_factors(config: RolloutSettings) -> bool:
     # Measured cloth has a shear stiffness of the same name.
     material = config.material
     return "woven" not in material and any(float(material.get(name, 1.0)) != 1.0 for name in ("warp", "weft", "shear"))
@@ -91,7 +89,7 @@ def _by_factors(config: DictConfig) -> bool:
 #: Words that make woven cloth isotropic: measured cloth, and fabrics with factors.
 _MEASURED, _FACTORS = ("material.woven=false",), ("material.warp=1", "material.weft=1", "material.shear=1")
 #: Part, and whether a settled config has it.
-_TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
+_TERMS: tuple[tuple[Part, Callable[[RolloutSettings], bool]], ...] = (
     (Part("bending", "folds are wide, not sharp", ("losses.terms.bending=null",), "bending"), _has("bending")),
     (Part("friction", "cloth hangs on the skin", ("losses.terms.friction=null",), "friction", "body"), _has("friction")),
     (
@@ -132,7 +130,7 @@ _TERMS: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
     (Part("gravity", "weight", ("gravity=0",), "gravity", watched=False), lambda config: float(config.gravity) > 0.0),
 )  # fmt: skip
 #: Of the fabric. Their rows are evidence: no energy is left out whose return would be noticed.
-_FABRIC: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
+_FABRIC: tuple[tuple[Part, Callable[[RolloutSettings], bool]], ...] = (
     (
         Part("fabrics of parts", "parts are of other cloth", ("fabrics=null",), watched=False, refitted=True),
         _given("fabrics"),
@@ -157,13 +155,13 @@ _FABRIC: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
         _by_factors,
     ),
 )
-_ACCURACY: tuple[tuple[Part, Callable[[DictConfig], bool]], ...] = (
+_ACCURACY: tuple[tuple[Part, Callable[[RolloutSettings], bool]], ...] = (
     (Part("last iterations", "forces balanced to 3%", ("solver.target_rg=0.03",), rivals="steps"), _target(0.03)),
     (Part("later iterations", "forces balanced to 5%", ("solver.target_rg=0.05",), rivals="steps"), _target(0.05)),
 )
 
 
-def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
+def parts_of(config: RolloutSettings, steppers: bool = False) -> list[Part]:
     """The parts that a settled config of ``hood rollout`` has; with ``steppers`` other ways to take its steps as well."""
     found = [part for part, there in (*_TERMS, *_FABRIC, *_ACCURACY) if there(config)]
     mode, friction = cloth_contact(config)
@@ -179,7 +177,7 @@ def parts_of(config: DictConfig, steppers: bool = False) -> list[Part]:
     return [*found, *_steppers(config)] if steppers else found
 
 
-def _steppers(config: DictConfig) -> list[Part]:
+def _steppers(config: RolloutSettings) -> list[Part]:
     """Other ways to take the steps: of a solver a network and fewer iterations, of a network the solver."""
     goal = chosen(config)
     if (goal is not None and goal.unit) or str(config.step) != "plain":
@@ -198,7 +196,7 @@ def _steppers(config: DictConfig) -> list[Part]:
     return [Part(name, purpose, words, rivals="steps", instead=True) for name, purpose, words in ways]
 
 
-def choose_parts(config: DictConfig, names: list[str], steppers: bool = False, others: Collection[str] = ()) -> list[Part]:
+def choose_parts(config: RolloutSettings, names: list[str], steppers: bool = False, others: Collection[str] = ()) -> list[Part]:
     """Those of the names; where none is given all, other ways to take the steps if ``steppers``.
 
     Args:

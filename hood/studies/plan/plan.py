@@ -22,6 +22,7 @@ from hood.app.plan_file import FREE, content_digest, key_of, plan_accuracy, read
 from hood.app.settings.compose import ConfigError, load_config, named_today, plain, with_words
 from hood.app.settings.overrides import plain_word
 from hood.app.settings.python_words import overrides as overrides_of
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.assets.files.library import locate
 from hood.native.build import cache_folder, processor
@@ -122,9 +123,9 @@ def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple
     return plan | {"cpu_seconds": time.process_time() - spent}, shown
 
 
-def _check(words: list[str], own: DictConfig) -> tuple[DictConfig, Tolerance, float | None]:
+def _check(words: list[str], own: DictConfig) -> tuple[RolloutSettings, Tolerance, float | None]:
     """The rollout's config, what is accepted and how long a frame may take, before anything is read."""
-    config = load_config("rollout", words)
+    config = RolloutSettings.from_words(words)
     check_config(config)
     for key, least, most in (("windows", 1, 5), ("frames", 1, 300)):
         if own[key] is None and key == "frames":
@@ -164,7 +165,7 @@ def _tolerance(own: DictConfig) -> Tolerance:
         raise ConfigError(str(error)) from error
 
 
-def _settled_words(asked: DictConfig, ready: Setup) -> list[str]:
+def _settled_words(asked: RolloutSettings, ready: Setup) -> list[str]:
     """What ``auto`` became."""
     alone = str(ready.config.stepper) == "newton"
     keys = [key for key in ("stepper", "refine") if asked[key] != ready.config[key] and not (alone and key == "refine")]
@@ -270,15 +271,12 @@ def planned(overrides: Sequence[str]) -> list[str]:
         ConfigError: an accuracy of no use, and what ``hood plan`` refuses.
     """
     overrides = named_today(overrides)
-    config = load_config("rollout", overrides)
+    config = RolloutSettings.from_words(overrides)
     accuracy = plan_accuracy(config)
     if accuracy is None:
         return list(overrides)
     words = [word for word in overrides if key_of(word) not in ("plan", *FREE) or key_of(word) == "num_frames"]
-    try:
-        Tolerance.read(accuracy)
-    except ValueError as error:
-        raise ConfigError(str(error).replace("accuracy=", "plan=")) from error
+    Tolerance.read(accuracy, "plan")
     own = with_words(load_config("plan"), [f"accuracy={accuracy}"])
     cache = cache_folder()
     path = (output_folder(config) if cache is None else cache / "plans") / f"plan-{_digest(words, accuracy)}.json"

@@ -23,11 +23,10 @@ from hood.app.common import (
     require_device,
     require_distinct,
     require_package,
-    require_same_config,
 )
 from hood.app.scene.garments import shape_coefficients
 from hood.app.settings.compose import ConfigError, load_config, options, plain
-from hood.app.settings.record import save_run_record
+from hood.app.settings.record import require_same_config, save_run_record
 from hood.app.stepping.steppers import find_option
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate, names

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf, open_dict
 
-from hood.app.common import require_same_config
 from hood.app.settings.compose import ConfigError, load_config
-from hood.app.settings.record import save_run_record
+from hood.app.settings.record import require_same_config, save_run_record
 from hood.cli.main import main
 
 TINY = [

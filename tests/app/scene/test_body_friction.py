@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hood.app.scene.motion import checked_friction
-from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene
 from hood.cli.main import main
 from hood.rollouts.file.reader import read_rollout
@@ -18,10 +19,10 @@ SHORT = ["garment=skirt", "sequence=plie", "stepper=newton", "num_frames=4", "vi
 
 def test_parts_have_their_factors_and_later_ones_count() -> None:
     words = ["garment=tank", "num_frames=3", "body_friction={below_pelvis:0,left_knee:4}"]
-    grip = make_scene(load_config("rollout", words)).friction_scale
+    grip = make_scene(RolloutSettings.from_words(words)).friction_scale
     assert grip is not None
     assert set(grip.tolist()) == {0.0, 1.0, 4.0}
-    assert make_scene(load_config("rollout", words[:2])).friction_scale is None
+    assert make_scene(RolloutSettings.from_words(words[:2])).friction_scale is None
 
 
 def test_a_factor_of_one_is_the_same_rollout_and_another_is_not(tmp_path: Path) -> None:
@@ -49,7 +50,7 @@ def test_a_network_says_that_it_was_trained_on_even_bodies(tmp_path: Path, capsy
 )
 def test_what_is_no_table_of_factors_is_refused(word: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        checked_friction(load_config("rollout", [word]))
+        checked_friction(RolloutSettings.from_words([word]))
 
 
 def test_parts_that_there_are_not_are_told_with_the_key(capsys: pytest.CaptureFixture[str]) -> None:

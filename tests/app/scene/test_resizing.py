@@ -7,8 +7,9 @@ import torch
 
 from hood.app.scene.garments import checked_sizes, cut_to_size, describe_ease, summarise_ease
 from hood.app.scene.motion import make_motion
-from hood.app.settings.compose import ConfigError, build, load_config
+from hood.app.settings.compose import ConfigError, build
 from hood.app.settings.python_words import overrides
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import lengths_of
 from hood.energies.damping import BendDamping, StretchDamping
@@ -20,14 +21,14 @@ from hood.scene.sizing import Sizes
 
 
 def test_a_size_is_one_factor_or_three_and_may_change() -> None:
-    assert checked_sizes(load_config("rollout")) == Sizes()
-    assert checked_sizes(load_config("rollout", ["size=[1,1.05,1]"])).start == (1.0, 1.05, 1.0)
-    growing = checked_sizes(load_config("rollout", ["size=0.9", "size_end={size:[1.1,1,1],seconds:3}"]))
+    assert checked_sizes(RolloutSettings.from_words([])) == Sizes()
+    assert checked_sizes(RolloutSettings.from_words(["size=[1,1.05,1]"])).start == (1.0, 1.05, 1.0)
+    growing = checked_sizes(RolloutSettings.from_words(["size=0.9", "size_end={size:[1.1,1,1],seconds:3}"]))
     assert growing == Sizes((0.9,) * 3, (1.1, 1.0, 1.0), 3.0)
-    assert checked_sizes(load_config("rollout", ["size_end=0.8"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
-    assert checked_sizes(load_config("rollout", ["size_end={size:0.8}"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
+    assert checked_sizes(RolloutSettings.from_words(["size_end=0.8"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
+    assert checked_sizes(RolloutSettings.from_words(["size_end={size:0.8}"])) == Sizes((1.0,) * 3, (0.8,) * 3, 2.0)
     given = overrides({"size_end": {"size": 0.8, "seconds": 0.5}})
-    assert checked_sizes(load_config("rollout", given)) == Sizes((1.0,) * 3, (0.8,) * 3, 0.5)
+    assert checked_sizes(RolloutSettings.from_words(given)) == Sizes((1.0,) * 3, (0.8,) * 3, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -48,11 +49,11 @@ def test_a_size_is_one_factor_or_three_and_may_change() -> None:
 )
 def test_what_is_no_size_names_the_key(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        checked_sizes(load_config("rollout", words))
+        checked_sizes(RolloutSettings.from_words(words))
 
 
 def test_factors_of_parts_cut_the_garment(garments: dict[str, Garment]) -> None:
-    config = load_config("rollout", ["garment=longsleeve", "size={sleeves:1.2,below_waistband:0.9}", "fit=none"])
+    config = RolloutSettings.from_words(["garment=longsleeve", "size={sleeves:1.2,below_waistband:0.9}", "fit=none"])
     sizes = checked_sizes(config)
     assert sizes == Sizes(parts=(1.2, 0.9), to_measure=False)
     motion = make_motion(config, torch.float32)
@@ -60,11 +61,11 @@ def test_factors_of_parts_cut_the_garment(garments: dict[str, Garment]) -> None:
     cut = cut_to_size(config, shirt, motion)
     assert isinstance(motion, BodyMotion)
     assert lengths_of(shirt, cut, "sleeves", motion.body) == pytest.approx(1.2, abs=0.02)
-    assert cut_to_size(load_config("rollout"), shirt, motion) is shirt
+    assert cut_to_size(RolloutSettings.from_words([]), shirt, motion) is shirt
 
 
 def test_a_pattern_made_to_measure_grows_with_the_body_and_another_does_not(garments: dict[str, Garment]) -> None:
-    motion = make_motion(load_config("rollout", ["betas=[2]"]), torch.float64)
+    motion = make_motion(RolloutSettings.from_words(["betas=[2]"]), torch.float64)
     tank = garments["tank"]
     own, plain = (dress(tank, motion, size=Sizes(to_measure=measured)).cloth for measured in (True, False))
     assert torch.equal(plain.rest_pos, torch.as_tensor(tank.rest_pos))
@@ -81,14 +82,14 @@ def test_how_a_garment_sits_is_said_of_both_ends() -> None:
 
 
 def test_wind_and_damping_reach_the_potential_and_are_left_out_by_default() -> None:
-    assert not {"air", "stretch_damping", "bend_damping"} & set(build(load_config("rollout").losses).terms)
+    assert not {"air", "stretch_damping", "bend_damping"} & set(build(RolloutSettings.from_words([]).losses).terms)
     words = ["losses=reference", "wind=3", "losses.terms.air.gusts=0.2", "seed=5", "damping=0.002"]
-    terms = build(load_config("rollout", words).losses).terms
+    terms = build(RolloutSettings.from_words(words).losses).terms
     assert isinstance(terms["air"], Wind)
     assert (terms["air"].x, terms["air"].y, terms["air"].z, terms["air"].gusts, terms["air"].seed) == (0, 0, -3, 0.2, 5)
     for name, kind in (("stretch_damping", StretchDamping), ("bend_damping", BendDamping)):
         assert isinstance(terms[name], kind)
         assert terms[name].time == 0.002
-    assert build(load_config("rollout", ["wind=[1,2,0]"]).losses).terms["air"].y == 2.0
+    assert build(RolloutSettings.from_words(["wind=[1,2,0]"]).losses).terms["air"].y == 2.0
     with pytest.raises(ValueError, match="gusts is 0.2, but there is no wind"):
-        build(load_config("rollout", ["losses.terms.air.gusts=0.2"]).losses)
+        build(RolloutSettings.from_words(["losses.terms.air.gusts=0.2"]).losses)

@@ -22,7 +22,7 @@ from hood.app.settings import old_names
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, plain
 from hood.app.settings.old_names import put_todays_keys
 from hood.app.settings.record import read_record
-from hood.app.settings.tables import measurement, objects, refinement
+from hood.app.settings.rollout_settings import measurement, objects, refinement
 from hood.app.setup import check_config
 from hood.cli.main import main
 from hood.energies.contact import Collision

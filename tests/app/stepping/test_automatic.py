@@ -14,7 +14,7 @@ import hood
 from hood.app.batch import batch
 from hood.app.batch.batch import find_jobs
 from hood.app.notices import collected
-from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping import automatic
 from hood.app.stepping.automatic import Measured
 from hood.cli.main import main
@@ -120,9 +120,9 @@ def test_on_a_cpu_the_solver_is_the_default_and_nothing_is_measured(
     ],
 )
 def test_a_key_of_the_network_keeps_the_network(words: list[str], stepper: str) -> None:
-    config = load_config("rollout", words)
+    config = RolloutSettings.from_words(words)
     assert config.stepper == stepper
-    assert config.stepping == load_config("rollout", [f"stepper={stepper}"]).stepping
+    assert config.stepping == RolloutSettings.from_words([f"stepper={stepper}"]).stepping
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_elsewhere_the_network_has_to_be_faster_and_as_accurate(
     network: Measured | None, stepper: str, monkeypatch: pytest.MonkeyPatch, tank_scene: Scene
 ) -> None:
     measured(monkeypatch, network)
-    config = load_config("rollout", ["garment=tank"])  # choose() is asked where the device leaves something to measure
+    config = RolloutSettings.from_words(["garment=tank"])  # choose() is asked where the device leaves something to measure
     choice = automatic.choose(config, build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8), tank_scene)
     assert choice.stepper == stepper
     (why,) = choice.why
@@ -174,7 +174,7 @@ def test_many_motions_have_one_stepper(monkeypatch: pytest.MonkeyPatch, capsys: 
     jobs = find_jobs("list.txt", Path("other"))
     assert jobs is not None
     with collected() as said:
-        assert batch.with_one_stepper(load_config("rollout", ["garment=tank"]), jobs).stepper == "network"
+        assert batch.with_one_stepper(RolloutSettings.from_words(["garment=tank"]), jobs).stepper == "network"
     assert said[-1].endswith("measured")
     assert len(asked) == 1
 
@@ -215,7 +215,7 @@ def test_advice_is_given_where_the_solver_is_faster(
 def test_refined_networks_are_measured_as_they_would_run(monkeypatch: pytest.MonkeyPatch, tank_scene: Scene) -> None:
     seen: list[Any] = []
     monkeypatch.setattr(automatic, "_measure", lambda stepper, *_, **__: seen.append(stepper))
-    config = load_config("rollout", ["garment=tank"])  # choose() is asked where the device leaves something to measure
-    config.checkpoint = "small.safetensors"
+    config = RolloutSettings.from_words(["garment=tank"])  # choose() is asked where the device leaves something to measure
+    config = config.with_values(checkpoint="small.safetensors")
     automatic.choose(config, load_simulator(Path("small.safetensors")), tank_scene)
     assert isinstance(seen[0], RefinedStepper)

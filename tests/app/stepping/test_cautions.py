@@ -12,7 +12,7 @@ import torch
 
 from hood.app import setup
 from hood.app.common import weigh
-from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_stepper
 from hood.app.stepping.cautions import evaluation_cautions, known_by_slope, scene_cautions
 from hood.app.stepping.steppers import losses_of
@@ -69,7 +69,7 @@ def test_terms_that_the_solver_knows_by_their_slope_are_named_where_it_works(qui
     assert known_by_slope(NewtonStepper(own, NewtonSettings()), own) == [sentence]
     assert known_by_slope(quickstart, own) == []
     layered = DEFAULT.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(), sides=SignedSelfContactPenalty())
-    for potential in (DEFAULT, coded_potential(), layered, losses_of(load_config("rollout", []))):
+    for potential in (DEFAULT, coded_potential(), layered, losses_of(RolloutSettings.from_words([]))):
         assert known_by_slope(refined(quickstart), potential) == []
 
 
@@ -77,7 +77,7 @@ def test_a_rollout_says_so_when_it_begins(monkeypatch: pytest.MonkeyPatch) -> No
     """Before any step is taken."""
     own, said = DEFAULT.with_terms(collision=OwnCollision()), list[str]()
     monkeypatch.setattr(setup, "losses_of", lambda config: own)
-    config = load_config("rollout", ["stepper=newton", "garment=tank", "sequence=walk_proud", "num_frames=2"])
+    config = RolloutSettings.from_words(["stepper=newton", "garment=tank", "sequence=walk_proud", "num_frames=2"])
     setup.set_up(config, make_stepper(config)[0], tell=said.append)
     assert sum("the solver knows the slope alone" in sentence for sentence in said) == 1
 
@@ -191,7 +191,7 @@ def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: NetworkStepper, c
 
 def test_a_gravity_that_nobody_was_trained_for(quickstart: NetworkStepper, tank_scene: Scene) -> None:
     heavy = quickstart.clone().eval()
-    weigh(heavy, load_config("rollout", ["gravity=98.1"]))
+    weigh(heavy, RolloutSettings.from_words(["gravity=98.1"]))
     (sentence,) = scene_cautions(heavy, tank_scene, DEFAULT, "quickstart")
     assert sentence.startswith("quickstart was not trained for gravity=98.1 (trained on 9.81)")
     assert scene_cautions(quickstart, tank_scene, DEFAULT, "quickstart") == []
@@ -199,7 +199,7 @@ def test_a_gravity_that_nobody_was_trained_for(quickstart: NetworkStepper, tank_
 
 @pytest.mark.parametrize("kind", ["stepper=newton", "stepper=refine", "checkpoint=small1"])
 def test_gravity_acts_in_every_stepper(kind: str) -> None:
-    stepper, _ = make_stepper(load_config("rollout", [kind, "gravity=1.62", "kernels=torch"]))
+    stepper, _ = make_stepper(RolloutSettings.from_words([kind, "gravity=1.62", "kernels=torch"]))
     assert stepper.gravity.tolist() == pytest.approx([0.0, -1.62, 0.0])
 
 
@@ -216,5 +216,5 @@ def test_a_network_says_that_it_knows_no_warp_and_weft(quickstart: NetworkSteppe
         for key, value in (("warp", "50"), ("weft", "20"), ("shear", "0.5")):
             assert f"material.{key}={value} (trained on 1)" in sentence
         assert sentence.endswith(ways)
-    solver, _ = make_stepper(load_config("rollout", ["stepper=newton"]))
+    solver, _ = make_stepper(RolloutSettings.from_words(["stepper=newton"]))
     assert scene_cautions(solver, woven, DEFAULT, "newton") == []

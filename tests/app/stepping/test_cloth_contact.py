@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from belt import write_belt, write_walk
 
-from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.cloth_contact import _why_not, describe_cloth_contact, summarise_cloth_contact
 from hood.cli.main import main
 from hood.energies.contact import Collision
@@ -98,7 +98,7 @@ class OwnCollision(Collision):
 
 @pytest.mark.usefixtures("compiled_layers")
 def test_only_losses_of_published_code_have_no_contact_of_cloth_by_themselves() -> None:
-    config, default = load_config("rollout", ["stepper=newton"]), default_potential()
+    config, default = RolloutSettings.from_words(["stepper=newton"]), default_potential()
     without = Potential({name: term for name, term in default.terms.items() if name not in ("collision", "friction")})
     for potential in (default, without, default.with_terms(collision=OwnCollision()), without.with_terms(other=OwnCollision())):
         assert _why_not(config, potential) == ""

@@ -8,6 +8,7 @@ import pytest
 
 import hood
 from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.cautions import idle_in_rollout, idle_in_training
 from hood.cli.main import main
 
@@ -47,13 +48,13 @@ BUSY = [
 
 @pytest.mark.parametrize(("words", "told"), IDLE, ids=lambda value: " ".join(value) if isinstance(value, list) else "")
 def test_a_word_that_does_nothing_is_told(words: list[str], told: str) -> None:
-    (line,) = idle_in_rollout(words, load_config("rollout", words))
+    (line,) = idle_in_rollout(words, RolloutSettings.from_words(words))
     assert line.startswith(told)
 
 
 @pytest.mark.parametrize("words", BUSY, ids=" ".join)
 def test_a_word_that_does_something_is_not(words: list[str]) -> None:
-    assert idle_in_rollout(words, load_config("rollout", words)) == []
+    assert idle_in_rollout(words, RolloutSettings.from_words(words)) == []
 
 
 def test_validation_that_never_happens_is_told() -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.app.settings.compose import load_config
 from hood.app.settings.python_words import overrides
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.refinement import chosen, describe_refinement, summarise_refinement
 from hood.cli.main import main
 from hood.rollouts.file.reader import read_rollout
@@ -103,8 +103,8 @@ def test_a_goal_is_a_value_with_its_unit(value: object, goal: float, unit: str) 
     found = chosen({"refine": value})
     assert found is not None
     assert (found.value, found.unit) == (goal, unit)
-    assert chosen(load_config("rollout", overrides({"refine": value}))) == found
-    assert chosen(load_config("rollout", [f"refine={value}"])) == found
+    assert chosen(RolloutSettings.from_words(overrides({"refine": value}))) == found
+    assert chosen(RolloutSettings.from_words([f"refine={value}"])) == found
 
 
 def test_a_budget_counts_whole_frames() -> None:

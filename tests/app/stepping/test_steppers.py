@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from hood.app.candidates import make_candidate
 from hood.app.settings.compose import ConfigError, load_config, options
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.steppers import find_option, make_solver, option_of, with_stepper
 from hood.cli.main import main
 from hood.energies.potential import default_potential
@@ -18,7 +19,7 @@ from hood.steppers.refined import GuessStepper, RefinedStepper
 
 @pytest.mark.parametrize("name", options("stepper"))
 def test_an_option_says_its_name(name: str) -> None:
-    config = load_config("rollout", [f"stepper={name}"])
+    config = RolloutSettings.from_words([f"stepper={name}"])
     assert str(config.stepper) == name
     option = option_of(config)
     assert option.name == name
@@ -28,15 +29,15 @@ def test_an_option_says_its_name(name: str) -> None:
 
 def test_the_last_of_several_words_counts() -> None:
     assert (
-        str(load_config("rollout", ["stepper=auto", "stepper=newton", "losses=reference", "losses=default"]).stepper)
+        str(RolloutSettings.from_words(["stepper=auto", "stepper=newton", "losses=reference", "losses=default"]).stepper)
         == "newton"
     )
 
 
 def test_another_option_takes_the_place_of_all_of_one() -> None:
-    config = load_config("rollout", ["stepper=network", "solver.target_rg=0.5"])
+    config = RolloutSettings.from_words(["stepper=network", "solver.target_rg=0.5"])
     other = with_stepper(config, "newton")
-    assert option_of(other) == option_of(load_config("rollout", ["stepper=newton"]))
+    assert option_of(other) == option_of(RolloutSettings.from_words(["stepper=newton"]))
     assert other.solver.target_rg == 0.5
     assert str(config.stepper) == "network"
     assert option_of(with_stepper(other, "network")) == option_of(config)
@@ -49,7 +50,7 @@ def test_evaluations_and_rollouts_make_the_same() -> None:
     assert type(guess.stepper) is GuessStepper
     assert isinstance(refined.stepper, RefinedStepper)
     assert type(refined.stepper.inner) is GuessStepper
-    rolled = make_solver(option_of(load_config("rollout", ["stepper=newton"])), config, default_potential())
+    rolled = make_solver(option_of(RolloutSettings.from_words(["stepper=newton"])), config, default_potential())
     assert rolled.config == newton.stepper.config
     for name, told in (("newton+5", "solved already"), ("refine", "give refine\\+5")):
         with pytest.raises(ConfigError, match=told):
@@ -71,7 +72,7 @@ def test_options_that_are_not_written_right_are_refused(stepping: object, told: 
 
 
 def test_keys_that_the_class_does_not_take_are_refused() -> None:
-    option = option_of(load_config("rollout", ["stepper=newton"]))
+    option = option_of(RolloutSettings.from_words(["stepper=newton"]))
     option.made_by["share"] = 0.1
     with pytest.raises(ConfigError, match="stepper=newton: .* is called with a potential"):
         make_solver(option, load_config("evaluate"), default_potential())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import build_cloth
@@ -135,10 +136,10 @@ def test_fabrics_of_another_unit_are_told(changes: dict[str, float], what: str) 
 
 
 def test_the_fabrics_that_ship_are_cloth() -> None:
-    from hood.app.settings.compose import build, load_config
+    from hood.app.settings.compose import build
 
     pos = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
     faces = np.array([[0, 1, 2], [1, 3, 2]])
     for name in ("chiffon", "nappa_leather", "wool_felt", "silk_habotai", "denim"):
-        material = build(load_config("rollout", [f"material={name}"]).material)
+        material = build(RolloutSettings.from_words([f"material={name}"]).material)
         assert doubt_fabric(build_cloth(pos, faces, material), "shirt") == []

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_stepper
 from hood.energies.potential import default_potential, reference_potential, scale
 from hood.energies.problem import StepProblem
@@ -75,7 +76,7 @@ def test_what_has_no_such_form_is_refused(skirt_scene):
 
 
 def test_the_command_makes_it_or_refuses():
-    config = load_config("rollout", ["stepper=newton", "step=fixed"])
+    config = RolloutSettings.from_words(["stepper=newton", "step=fixed"])
     assert isinstance(make_stepper(config)[0], CapturedNewton)
     with pytest.raises(ConfigError, match="steps of stepper=refine are plain"):
-        make_stepper(load_config("rollout", ["stepper=refine", "step=fixed"]))
+        make_stepper(RolloutSettings.from_words(["stepper=refine", "step=fixed"]))

@@ -1,0 +1,226 @@
+"""The settings of a rollout: its configuration, typed key by key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, TypeVar
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from hood.app.settings.compose import ConfigError, brief, load_config, plain, with_words
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutSettings(Mapping[str, Any]):
+    """What ``configs/rollout.yaml`` says with the words of a command, checked by :func:`hood.app.settings.compose.load_config`.
+
+    The file says what each key means. Tables are typed where they are read (:func:`refinement` and others); ``Any`` is of
+    several kinds, which the reader checks. Groups are nodes for :func:`hood.app.settings.compose.build`.
+    """
+
+    material: DictConfig
+    losses: DictConfig
+    model: DictConfig | None = None
+    solver: DictConfig
+    stepper: str
+    stepping: DictConfig | None = None
+    garment: str | ListConfig
+    sequence: str
+    body: str
+    checkpoint: str
+    plan: str | float | None
+    num_frames: int
+    device: str
+    precision: str
+    kernels: str
+    step: str
+    refine: Any
+    guard: str
+    seed: int
+    output: str
+    worn: bool
+    fail_on: str
+    root: str | None
+    resume: bool
+    betas: ListConfig | None
+    gender: str | None
+    hands: str
+    up: str
+    person: str | int | None
+    unit: str | float | None
+    file_fps: float | None
+    start: str | float | None
+    stop: str | float | None
+    loop: int
+    blend_in: Any
+    animation: str | int | None
+    fps: float
+    output_fps: float | None
+    gravity: float
+    wind: Any
+    damping: float
+    size: Any
+    fit: str
+    size_end: Any
+    fabrics: DictConfig | None
+    fabrics_seam: float
+    body_friction: DictConfig | None
+    pins: Any
+    events: ListConfig
+    objects: Any
+    weld: str | float
+    shells: str
+    small_parts: str
+    triangulate: bool
+    settle: str | int
+    layers: str | ListConfig
+    cloth_contact: Any
+    metrics: Any
+    colour: str
+    texture: Any
+    thin_body: float
+    video: Any
+    sheet: bool
+    refine_mesh: int
+    formats: ListConfig
+
+    @classmethod
+    def of(cls, config: DictConfig) -> RolloutSettings:
+        """Those of a loaded configuration of ``hood rollout``."""
+        return cls(**{str(key): config[key] for key in config})
+
+    @classmethod
+    def from_words(cls, words: Sequence[str]) -> RolloutSettings:
+        """Those that words of ``hood rollout`` ask for. Raises ConfigError as :func:`hood.app.settings.compose.load_config`."""
+        return cls.of(load_config("rollout", words))
+
+    def with_values(self, **changes: Any) -> RolloutSettings:
+        """The same with other values."""
+        return replace(self, **changes)
+
+    def with_words(self, words: Sequence[str]) -> RolloutSettings:
+        """The same with some ``key=value`` more, see :func:`hood.app.settings.compose.with_words`."""
+        return RolloutSettings.of(with_words(OmegaConf.create(dict(self)), words))
+
+    def __getitem__(self, key: str) -> Any:
+        if key not in self.__dataclass_fields__:
+            raise KeyError(key)
+        return getattr(self, key)
+
+    def __contains__(self, key: object) -> bool:
+        return key in list(self)
+
+    def __iter__(self) -> Iterator[str]:
+        return (field.name for field in fields(self) if field.name not in _ABSENT or self[field.name] is not None)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+#: Groups that may be left out.
+_ABSENT = ("model", "stepping")
+
+
+#: Settings of a rollout, or the configuration of another command that has the keys which are asked for.
+Settings = RolloutSettings | DictConfig
+
+
+# ---- keys that take one value, or a table of it and further ones -----------------------------------------------------------
+
+
+class Refinement(NamedTuple):
+    """``refine``: how far steps are refined (:mod:`hood.app.stepping.refinement`).
+
+    Args:
+        goal: a number of iterations, or what they are to reach.
+        method: how steps are refined.
+        most: iterations of a frame at most.
+        table: file of a table that says with how many iterations to begin.
+    """
+
+    goal: int | float | str = "auto"
+    method: str = "newton"
+    most: int = 50
+    table: str | None = None
+
+
+class Measurement(NamedTuple):
+    """``metrics``: what is measured in frames.
+
+    Args:
+        kind: in every frame, one of :data:`hood.rollouts.frame.METRIC_CHOICES`.
+        surface_every: frames from one measurement of the cut surface to the next.
+        fields: values of every vertex that are written.
+    """
+
+    kind: str = "all"
+    surface_every: int = 5
+    fields: tuple[str, ...] = ()
+
+
+class ClothContact(NamedTuple):
+    """``cloth_contact``: which layers of cloth are kept apart, and their coefficient of friction."""
+
+    mode: str = "auto"
+    friction: float = 0.0
+
+
+class Objects(NamedTuple):
+    """``objects``: names of the objects of a garment's file that are worn, and of those of a file that are the body."""
+
+    garment: tuple[str | int, ...] = ()
+    body: tuple[str | int, ...] = ()
+
+
+_Table = TypeVar("_Table", Refinement, Measurement, ClothContact, Objects)
+#: By type of the usual value: the types that may stand for it, and what they are called.
+_KINDS: dict[type, tuple[tuple[type, ...], str]] = {
+    int: ((int,), "a whole number"),
+    float: ((int, float), "a number"),
+    str: ((str, int, float), "text"),
+    tuple: ((list, tuple), "a list of names in brackets"),
+    type(None): ((str, type(None)), "a file"),
+}
+
+
+def refinement(config: Mapping[Any, Any]) -> Refinement:
+    """What ``refine`` says. Raises ConfigError where a part of its table is unknown or of another kind, as the others do."""
+    return _read(config, "refine", Refinement)
+
+
+def measurement(config: Mapping[Any, Any]) -> Measurement:
+    """What ``metrics`` says."""
+    found = _read(config, "metrics", Measurement)
+    return found._replace(fields=tuple(map(str, found.fields)))
+
+
+def cloth_contact(config: Mapping[Any, Any]) -> ClothContact:
+    """What ``cloth_contact`` says."""
+    return _read(config, "cloth_contact", ClothContact)
+
+
+def objects(config: Mapping[Any, Any]) -> Objects:
+    """What ``objects`` says."""
+    return _read(config, "objects", Objects)
+
+
+def with_value(given: Any, first: str, value: Any) -> Any:
+    """The value of a key with ``value`` for what it says alone or as ``first``; what else a table says stays."""
+    return {**given, first: value} if isinstance(given, Mapping) else value
+
+
+def _read(config: Mapping[Any, Any], key: str, kind: type[_Table]) -> _Table:
+    usual, given = kind(), plain(config.get(key))
+    names = kind._fields
+    table = given if isinstance(given, Mapping) else {} if given is None else {names[0]: given}
+    for name, value in table.items():
+        if name not in names:
+            some = ", ".join(names)
+            raise ConfigError(f"{key}={brief(given)}: {name!r} is no part of it; give a value, or a table of some of {some}")
+        types, called = _KINDS[type(getattr(usual, name))]
+        if isinstance(value, bool) or not isinstance(value, types):
+            where = f"{key}={brief(given)}" + (f": {name}" if isinstance(given, Mapping) else "")
+            raise ConfigError(f"{where}: give {called}, not {brief(value)}")
+    said: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
+    return kind(**said)
