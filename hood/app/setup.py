@@ -203,7 +203,7 @@ def _check_start(config: RolloutSettings, stepper: Stepper, scene: Scene, tell: 
 def _check_metrics(config: RolloutSettings) -> None:
     asked = measurement(config)
     if asked.kind not in METRIC_CHOICES:
-        raise ConfigError(unknown("metrics", asked.kind, METRIC_CHOICES))
+        raise ConfigError(unknown("value for metrics", asked.kind, METRIC_CHOICES))
     if asked.surface_every < 1:
         raise ConfigError(f"metrics={brief(config.metrics)}: surface_every is {asked.surface_every}; it must be at least 1")
 

@@ -29,7 +29,7 @@ def check_cloth_contact(config: RolloutSettings) -> None:
     """Raise ConfigError where the key asks for what the other keys rule out."""
     mode, friction = cloth_contact(config)
     if mode not in _CHOICES:
-        raise ConfigError(unknown("cloth_contact", mode, _CHOICES))
+        raise ConfigError(unknown("value for cloth_contact", mode, _CHOICES))
     if not 0.0 <= friction < math.inf:
         raise ConfigError(
             f"cloth_contact={brief(config.cloth_contact)}: friction is {friction}; give a coefficient of at least 0; 0 for none"
