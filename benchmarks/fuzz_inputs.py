@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from hood.app.settings.record import require_same_config
 from hood.app.settings.compose import load_config
+from hood.app.settings.record import require_same_config
 from hood.assets.body.load import read_model
 from hood.assets.files.text import read_indices
 from hood.assets.formats.mesh_file import read_mesh_file
