@@ -74,7 +74,7 @@ def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], Dict
     return given, load_config(command, overrides)
 
 
-def frame_count(config: Settings) -> int | None:
+def frame_count(config: DictConfig) -> int | None:
     """``config.num_frames`` of a command that shows frames of a rollout: the first so many; None: all.
 
     Raises:

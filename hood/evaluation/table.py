@@ -213,17 +213,18 @@ def evaluate(
     the 99th percentile of the distance to the minimum of a step. Of the ``rollouts``, ``failed`` is the share that failed, as
     non-finite or by :data:`FAILURE_STRAIN`, and ``frames_to_failure`` the median of the frames where they did, rollouts that
     lasted counted as later than all (None: less than half failed). ``steps`` and ``radius`` are None without a network.
-    ``L_NAME`` is the energy of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum,
-    ``L_guess`` the potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of
-    ‖∂L/∂x_v‖₂, averaged over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of
-    vertices deeper than 2 mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's
-    triangles that the body cuts, ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth
-    triangles that pass through each other, all three of the frames where they are measured; ``drift`` [m] is the largest of
-    those measured (None: none was). Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the median,
-    ``gap_p95`` the 95th percentile, ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share
-    where minimisations ended in different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart;
-    ``L_states`` is L_total of these states alone and ``L_above`` what it is above their minima [J], both medians. Columns of
-    :data:`INTERVALS` have 95% intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
+    ``network`` says what kind it is, ``as_in_paper`` whether latent, features and output are those of the paper. ``L_NAME`` is
+    the energy of every term that acts in the row, those of :data:`TERMS` in any case, ``L_total`` their sum, ``L_guess`` the
+    potential of the inertial guess on the same states. ``gradient_norm`` [N] is the mean over vertices of ‖∂L/∂x_v‖₂, averaged
+    over frames; ``rg`` and ``strain_p99`` are medians over frames; ``penetration`` is the mean share of vertices deeper than 2
+    mm, ``penetration_worst`` that of the worst frame; ``cut_faces`` is the mean share of the cloth's triangles that the body
+    cuts, ``cut_faces_worst`` that of the worst frame, ``crossings`` the mean number of pairs of cloth triangles that pass
+    through each other, all three of the frames where they are measured; ``drift`` [m] is the largest of those measured (None:
+    none was). Of the states whose gap is computed (``gap_states`` of them): ``gap`` is the median, ``gap_p95`` the 95th
+    percentile, ``unconverged`` the share whose reference missed its accuracy and ``disagree`` the share where minimisations
+    ended in different minima, ``gap_spread`` [e0] the 95th percentile of how far these are apart; ``L_states`` is L_total of
+    these states alone and ``L_above`` what it is above their minima [J], both medians. Columns of :data:`INTERVALS` have 95%
+    intervals over rollouts, ``NAME_low`` and ``NAME_high``, from two rollouts on.
     """
     rows, done = [], 0
     for candidate in candidates:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hood.app.settings.compose import ConfigError, brief, load_config, plain, with_words
+from hood.rollouts.verdict.surface import SURFACE_STRIDE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +156,7 @@ class Measurement(NamedTuple):
     """
 
     kind: str = "all"
-    surface_every: int = 5
+    surface_every: int = SURFACE_STRIDE
     fields: tuple[str, ...] = ()
 
 

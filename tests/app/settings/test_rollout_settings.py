@@ -11,7 +11,10 @@ import yaml
 
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, plain
 from hood.app.settings.rollout_settings import (
+    ClothContact,
     Measurement,
+    Objects,
+    Refinement,
     RolloutSettings,
     cloth_contact,
     measurement,
@@ -53,6 +56,12 @@ def test_they_do_not_change_but_are_copied_with_other_values() -> None:
     assert settings.num_frames == 150
     with pytest.raises(ConfigError, match="no such key"):
         settings.with_words(["frames=4"])
+
+
+def test_the_usual_parts_of_a_table_are_what_the_configuration_says() -> None:
+    usual = RolloutSettings.from_words([])
+    for read, kind in ((refinement, Refinement), (measurement, Measurement), (cloth_contact, ClothContact), (objects, Objects)):
+        assert read(usual) == kind()
 
 
 def test_a_value_alone_is_the_first_part_of_a_table() -> None:
