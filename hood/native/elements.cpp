@@ -7,7 +7,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "lanes.h"
+#include "element_laws.h"
 #include "vector.h"
 #include "vertex_terms.h"
 
@@ -15,11 +15,6 @@ namespace {
 
 inline V8 larger(V8 a, V8 b) { return a > b ? a : b; }
 inline V8 largest(const V8* a) { return larger(magnitude(a[0]), larger(magnitude(a[1]), magnitude(a[2]))); }
-
-// One corner of eight elements.
-inline void gather(const double* pos, const int32_t* corner, V8* x) {
-    for (int k = 0; k < 3; ++k) x[k] = lanes([&](int lane) { return pos[3 * (int64_t)corner[lane] + k]; });
-}
 
 // Adds the energies of ``count`` lanes to their scenes.
 inline void add_energy(V8 value, const int32_t* scene, int count, double* energy) {
@@ -59,35 +54,29 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
     for (int64_t i = 0; i < faces->count; i += LANES) {
         const int count = (int)std::min<int64_t>(LANES, faces->count - i);
         const int32_t* corners = faces->corners + i;
-        V8 x[3][3], f0[3], f1[3], m[4];
-        for (int c = 0; c < 3; ++c) gather(pos, corners + c * padded, x[c]);
+        V8 offset[2][3], f[2][3], m[4];
+        offsets_of<3, 3>(pos, corners, padded, offset);
         for (int c = 0; c < 4; ++c) m[c] = load<V8>(faces->inverse + c * padded + i);
-        for (int k = 0; k < 3; ++k) {
-            const V8 d1 = x[1][k] - x[0][k], d2 = x[2][k] - x[0][k];
-            f0[k] = m[0] * d1 + m[2] * d2, f1[k] = m[1] * d1 + m[3] * d2;
-        }
-        const V8 g00 = 0.5 * (dot(f0, f0) - 1.0), g01 = 0.5 * dot(f0, f1), g11 = 0.5 * (dot(f1, f1) - 1.0);
+        for (int a = 0; a < 2; ++a)
+            for (int k = 0; k < 3; ++k) f[a][k] = m[a] * offset[0][k] + m[2 + a] * offset[1][k];
+        const Strain g = green_strain(f);
         const V8 weight = load<V8>(faces->weight + i);
-        V8 s00, s01, s11;
+        const auto add = [&](const auto& law) {
+            add_energy(weight * density_of(law, g), faces->scene + i, count, energy);
+            return stress_of(law, g, weight);
+        };
+        Stress s;
         if (faces->weave) {
             const double* roots = faces->weave + i;
-            const V8 first = load<V8>(roots), coupled = load<V8>(roots + padded);
-            const V8 second = load<V8>(roots + 2 * padded), turn = load<V8>(roots + 3 * padded);
-            const V8 a = first * g00 + coupled * g11, b = second * g11, c = 2.0 * turn * g01;
-            add_energy(0.5 * weight * (a * a + b * b + c * c), faces->scene + i, count, energy);
-            s00 = weight * first * a, s01 = weight * turn * c, s11 = weight * (coupled * a + second * b);
+            s = add(Weave{load<V8>(roots), load<V8>(roots + padded), load<V8>(roots + 2 * padded), load<V8>(roots + 3 * padded)});
         } else {
-            const V8 trace = g00 + g11;
-            const V8 mu = load<V8>(faces->mu + i), lambda = load<V8>(faces->lambda + i);
-            add_energy(weight * isotropic_density(mu, lambda, g00, g01, g11), faces->scene + i, count, energy);
-            s00 = weight * (2.0 * mu * g00 + lambda * trace), s01 = weight * 2.0 * mu * g01;
-            s11 = weight * (2.0 * mu * g11 + lambda * trace);
+            s = add(Isotropic{load<V8>(faces->mu + i), load<V8>(faces->lambda + i)});
         }
         if (!gradient) continue;
-        // First Piola-Kirchhoff stress F S, S = 2 mu G + lambda tr G or that of the weave, pulled back to the two edges.
+        // First Piola-Kirchhoff stress F S, pulled back to the two edges.
         V8 force[3][3];
         for (int k = 0; k < 3; ++k) {
-            const V8 p0 = s00 * f0[k] + s01 * f1[k], p1 = s01 * f0[k] + s11 * f1[k];
+            const V8 p0 = s.s00 * f[0][k] + s.s01 * f[1][k], p1 = s.s01 * f[0][k] + s.s11 * f[1][k];
             force[1][k] = m[0] * p0 + m[1] * p1, force[2][k] = m[2] * p0 + m[3] * p1;
             force[0][k] = -(force[1][k] + force[2][k]);
         }
@@ -98,34 +87,23 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
 // The same for bending; hinges with a degenerate face have the angle 0 and no force.
 void elements_hinges(const Hinges* hinges, const double* pos, double* energy, double* gradient) {
     const int64_t padded = hinges->padded;
-    const V8 zero = all(0.0), one = all(1.0);
     for (int64_t i = 0; i < hinges->count; i += LANES) {
         const int count = (int)std::min<int64_t>(LANES, hinges->count - i);
         const int32_t* corners = hinges->corners + i;
-        V8 x[4][3], e[3], edge[3], arm_a[3], arm_b[3], n1[3], n2[3];
-        for (int c = 0; c < 4; ++c) gather(pos, corners + c * padded, x[c]);
-        for (int k = 0; k < 3; ++k) e[k] = x[1][k] - x[0][k], arm_a[k] = x[2][k] - x[0][k], arm_b[k] = x[3][k] - x[0][k];
-        const V8 size = larger(larger(largest(e), larger(largest(arm_a), largest(arm_b))), all(TINY)), scale = 1.0 / size;
-        for (int k = 0; k < 3; ++k) edge[k] = scale * e[k], arm_a[k] *= scale, arm_b[k] *= scale;
-        cross(edge, arm_a, n1), cross(arm_b, edge, n2);
-        const V8 edge_sq = dot(edge, edge), n1_sq = dot(n1, n1), n2_sq = dot(n2, n2);
-        const I8 sound = regular(n1_sq, edge_sq * dot(arm_a, arm_a)) & regular(n2_sq, edge_sq * dot(arm_b, arm_b));
-        const V8 length = root(edge_sq), along = dot(n1, arm_b), level = dot(n1, n2);
-        const V8 angle = angle_of(sound ? -length * along : zero, sound ? level : one);
-        const V8 weight = load<V8>(hinges->weight + i), factor = hinges->current_length ? weight * dot(e, e) : weight;
-        const V8 bend = hinges->current_length ? angle : bend_of(angle, load<V8>(hinges->rest_angle + i));
-        add_energy(0.5 * factor * bend * bend, hinges->scene + i, count, energy);
+        V8 offset[3][3], force[4][3];
+        offsets_of<4, 3>(pos, corners, padded, offset);
+        const V8* edge = offset[0];
+        const V8 scale = 1.0 / larger(larger(largest(edge), larger(largest(offset[1]), largest(offset[2]))), all(TINY));
+        Hinge h;
+        hinge_of(offset, scale, h);
+        const V8 weight = load<V8>(hinges->weight + i), factor = hinges->current_length ? weight * dot(edge, edge) : weight;
+        const V8 bend = hinges->current_length ? h.angle : bend_of(h.angle, load<V8>(hinges->rest_angle + i));
+        add_energy(bending_energy(factor, bend), hinges->scene + i, count, energy);
         if (!gradient) continue;
-        // The angle's slopes at the opposite vertices; those at the edge's ends follow from no net force and torque.
-        const V8 pull = sound ? -factor * bend * length * scale : zero, safe = sound ? edge_sq : one;
-        const V8 by_a = pull / (sound ? n1_sq : one), by_b = pull / (sound ? n2_sq : one);
-        const V8 share_a = dot(edge, arm_a) / safe, share_b = dot(edge, arm_b) / safe, stretch = weight * bend * bend;
-        V8 force[4][3];
-        for (int k = 0; k < 3; ++k) {
-            const V8 at_a = by_a * n1[k], at_b = by_b * n2[k], at_end = -(share_a * at_a + share_b * at_b);
-            const V8 pulled = hinges->current_length ? stretch * e[k] : zero;
-            force[2][k] = at_a, force[3][k] = at_b, force[1][k] = at_end + pulled;
-            force[0][k] = -(at_a + at_b + at_end) - pulled;
+        hinge_slopes(h, -factor * bend * h.length * scale, force);
+        if (hinges->current_length) {
+            const V8 stretch = weight * bend * bend;
+            for (int k = 0; k < 3; ++k) force[0][k] -= stretch * edge[k], force[1][k] += stretch * edge[k];
         }
         scatter<4>(force, corners, padded, count, gradient);
     }

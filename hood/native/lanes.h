@@ -38,6 +38,16 @@ inline void cross(const V8* a, const V8* b, V8* c) {
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
+// Offsets [m] of the other corners of eight elements from the first, by positions in rows of ROW numbers.
+template <int CORNERS, int ROW> inline void offsets_of(const double* pos, const int32_t* corners, int64_t padded, V8 (*offset)[3]) {
+    const auto place = [&](int c, int k) {
+        return lanes([&](int lane) { return pos[ROW * (int64_t)corners[c * padded + lane] + k]; });
+    };
+    const V8 first[3] = {place(0, 0), place(0, 1), place(0, 2)};
+    for (int c = 1; c < CORNERS; ++c)
+        for (int k = 0; k < 3; ++k) offset[c - 1][k] = place(c, k) - first[k];
+}
+
 // Coefficients of (atan(t) / t - 1) / t^2 in t^2 up to tan(pi / 8), a Chebyshev fit with an error of 5e-18.
 constexpr double ATAN[] = {
     -0.333333333333333302,  0.199999999999955207,   -0.142857142846665429,  0.111111110152563617,

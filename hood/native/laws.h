@@ -1,9 +1,7 @@
-// The laws of contact and friction, the compiled forms of hood/energies/laws.py, and those of membrane and bending, of
-// hood/energies/membrane.py and bending.py. Every compiled pass takes them from here. Orders of operations are part of a law: bits depend on them.
+// The laws of contact and friction, the compiled forms of hood/energies/laws.py. Every compiled pass takes them from here. Those of
+// membrane and bending are in element_laws.h. Orders of operations are part of a law: bits depend on them.
 #pragma once
 #include <cmath>
-
-#include "lanes.h"
 
 namespace {
 
@@ -37,27 +35,5 @@ inline double slip_slope(double y, double limit) { return y < limit ? (2.0 - y /
 inline double friction_slope(double force, double y, double limit) { return force * slip_slope(y, limit); }
 // F f''. The solvers need f'' <= f' / y: the difference is what may make a matrix indefinite.
 inline double friction_curvature(double force, double y, double limit) { return y < limit ? force * 2.0 * (1.0 - y / limit) / limit : 0.0; }
-
-// ---- membrane: mu tr G^2 + lambda / 2 tr^2 G of the Green strain, eight faces at a time --------------------------------------
-
-inline V8 isotropic_density(V8 mu, V8 lambda, V8 g00, V8 g01, V8 g11) {
-    const V8 trace = g00 + g11, square = g00 * g00 + g11 * g11 + 2.0 * g01 * g01;
-    return mu * square + 0.5 * lambda * trace * trace;
-}
-
-// ---- bending: of angles of hinges, eight at a time ---------------------------------------------------------------------------
-
-constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
-constexpr double DEGENERATE = (8.0 * EPS) * (8.0 * EPS);  // square of a sine, as in hood.mesh.geometry
-constexpr double TURN = 6.283185307179586476925;
-
-// Whether a triangle has an area, by the square of a cross product and that of the lengths.
-inline I8 regular(V8 cross_sq, V8 product_sq) { return (cross_sq > DEGENERATE * product_sq) & (cross_sq > all(TINY / EPS)); }
-
-inline V8 bend_of(V8 angle, V8 rest_angle) {
-    const V8 bend = angle - rest_angle, zero = all(0.0);
-    // Both angles are within a half turn, so at most one turn is off.
-    return bend - (bend > 0.5 * TURN ? all(TURN) : bend < -0.5 * TURN ? all(-TURN) : zero);
-}
 
 }  // namespace

@@ -10,7 +10,7 @@
 #include <cstdint>
 #include <cstring>
 
-#include "lanes.h"
+#include "element_laws.h"
 #include "layer_grips.h"
 #include "layer_view.h"
 #include "threads.h"
@@ -143,78 +143,38 @@ template <class T> struct HingeRecord {
     T row[14];
 };
 
-inline void gather(const double* pos, const int32_t* index, V8* x) {
-    for (int k = 0; k < 3; ++k) x[k] = lanes([&](int lane) { return pos[4 * (int64_t)index[lane] + k]; });
-}
-
-struct Strain {
-    V8 f[2][3], g00, g01, g11;
-};
-
-inline void strain_of(const Engine& e, const double* pos, int64_t i, Strain& s) {
-    V8 x[3][3];
-    for (int c = 0; c < 3; ++c) gather(pos, e.face_corners + c * e.num_faces + i, x[c]);
+inline Strain strain_of(const Engine& e, const double* pos, int64_t i, V8 (*f)[3]) {
+    V8 offset[2][3];
+    offsets_of<3, 4>(pos, e.face_corners + i, e.num_faces, offset);
     for (int a = 0; a < 2; ++a) {
         const V8 one = load<V8>(e.shape + (3 * a + 1) * e.num_faces + i), two = load<V8>(e.shape + (3 * a + 2) * e.num_faces + i);
-        for (int k = 0; k < 3; ++k) s.f[a][k] = (x[1][k] - x[0][k]) * one + (x[2][k] - x[0][k]) * two;
+        for (int k = 0; k < 3; ++k) f[a][k] = offset[0][k] * one + offset[1][k] * two;
     }
-    s.g00 = 0.5 * (dot(s.f[0], s.f[0]) - 1.0);
-    s.g01 = 0.5 * dot(s.f[0], s.f[1]);
-    s.g11 = 0.5 * (dot(s.f[1], s.f[1]) - 1.0);
+    return green_strain(f);
 }
 
-// Changes strains by what the step has not added to them.
-inline void since_start(const Engine& e, int64_t i, Strain& s) {
-    s.g00 -= load<V8>(e.face_before + i);
-    s.g01 -= load<V8>(e.face_before + e.num_faces + i);
-    s.g11 -= load<V8>(e.face_before + 2 * e.num_faces + i);
+// What the step has added to strains.
+inline Strain since_start(const Engine& e, int64_t i, const Strain& g) {
+    const double* before = e.face_before + i;
+    return {g.g00 - load<V8>(before), g.g01 - load<V8>(before + e.num_faces), g.g11 - load<V8>(before + 2 * e.num_faces)};
 }
 
-// Cloth with warp and weft: its density is half the sum of the squares of first g00 + coupled g11, second g11 and turn 2 g01.
-struct Weave {
-    V8 first, coupled, second, turn;
-};
+inline Isotropic isotropic_of(const Engine& e, int64_t i) { return {load<V8>(e.mu + i), load<V8>(e.lambda + i)}; }
 
 inline Weave weave_of(const Engine& e, int64_t i) {
     const double* roots = e.weave + i;
     return {load<V8>(roots), load<V8>(roots + e.num_faces), load<V8>(roots + 2 * e.num_faces), load<V8>(roots + 3 * e.num_faces)};
 }
 
-inline V8 density_of(const Weave& w, const Strain& s) {
-    const V8 a = w.first * s.g00 + w.coupled * s.g11, b = w.second * s.g11, c = 2.0 * w.turn * s.g01;
-    return 0.5 * (a * a + b * b + c * c);
-}
-
-inline void add_stress(const Weave& w, const Strain& s, V8 factor, V8& s00, V8& s01, V8& s11) {
-    const V8 a = w.first * s.g00 + w.coupled * s.g11;
-    s00 += factor * w.first * a, s01 += factor * 2.0 * w.turn * w.turn * s.g01;
-    s11 += factor * (w.coupled * a + w.second * w.second * s.g11);
-}
-
-double woven_energy(const Engine& e, const double* pos, Range range) {
+template <auto law_of> double face_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += LANES) {
-        Strain s;
-        strain_of(e, pos, i, s);
-        const Weave w = weave_of(e, i);
-        sum += total(load<V8>(e.area + i) * density_of(w, s));
+        V8 f[2][3];
+        const Strain g = strain_of(e, pos, i, f);
+        const auto law = law_of(e, i);
+        sum += total(load<V8>(e.area + i) * density_of(law, g));
         if (!e.face_rate) continue;
-        since_start(e, i, s);
-        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * density_of(w, s));
-    }
-    return sum;
-}
-
-double face_energy(const Engine& e, const double* pos, Range range) {
-    double sum = 0.0;
-    for (int64_t i = range.begin; i < range.end; i += LANES) {
-        Strain s;
-        strain_of(e, pos, i, s);
-        const V8 mu = load<V8>(e.mu + i), lambda = load<V8>(e.lambda + i);
-        sum += total(load<V8>(e.area + i) * isotropic_density(mu, lambda, s.g00, s.g01, s.g11));
-        if (!e.face_rate) continue;
-        since_start(e, i, s);
-        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * isotropic_density(mu, lambda, s.g00, s.g01, s.g11));
+        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * density_of(law, since_start(e, i, g)));
     }
     return sum;
 }
@@ -223,51 +183,47 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
     FaceRecord<T>* records = (FaceRecord<T>*)e.face_model;
     const V8 zero = all(0.0), one = all(1.0);
     for (int64_t i = range.begin; i < range.end; i += LANES) {
-        Strain s;
-        strain_of(e, pos, i, s);
-        const V8 mu = load<V8>(e.mu + i), area = load<V8>(e.area + i);
-        const V8 pressure = load<V8>(e.lambda + i) * (s.g00 + s.g11);
-        V8 s00 = 2.0 * mu * s.g00 + pressure, s01 = 2.0 * mu * s.g01, s11 = 2.0 * mu * s.g11 + pressure;
-        V8 bulk = load<V8>(e.bulk + i), soft = load<V8>(e.soft + i);
+        V8 f[2][3];
+        const Strain g = strain_of(e, pos, i, f);
+        const auto stress = [&](const auto& law) {
+            Stress s = stress_of(law, g, one);
+            if (e.face_rate) {
+                const Stress viscous = stress_of(law, since_start(e, i, g), load<V8>(e.face_rate + i));
+                s.s00 += viscous.s00, s.s01 += viscous.s01, s.s11 += viscous.s11;
+            }
+            return s;
+        };
+        const V8 area = load<V8>(e.area + i), stiffer = e.face_rate ? root(1.0 + load<V8>(e.face_rate + i)) : one;
+        const V8 bulk = load<V8>(e.bulk + i) * stiffer, soft = load<V8>(e.soft + i) * stiffer;
         Weave weave;
+        Stress s;
         if (e.weave) {
             weave = weave_of(e, i);
-            s00 = s01 = s11 = zero;
-            add_stress(weave, s, one, s00, s01, s11);
-            V8 size = root(area);
-            if (e.face_rate) {
-                const V8 rate = load<V8>(e.face_rate + i);
-                since_start(e, i, s);
-                add_stress(weave, s, rate, s00, s01, s11);
-                size *= root(1.0 + rate);
-            }
+            s = stress(weave);
+            const V8 size = root(area) * stiffer;
             weave.first *= size, weave.coupled *= size, weave.second *= size, weave.turn *= size;
-        } else if (e.face_rate) {
-            const V8 rate = load<V8>(e.face_rate + i), stiffer = root(1.0 + rate);
-            since_start(e, i, s);
-            const V8 added = load<V8>(e.lambda + i) * (s.g00 + s.g11);
-            s00 += rate * (2.0 * mu * s.g00 + added), s01 += rate * 2.0 * mu * s.g01, s11 += rate * (2.0 * mu * s.g11 + added);
-            bulk *= stiffer, soft *= stiffer;
+        } else {
+            s = stress(isotropic_of(e, i));
         }
         // The positive part of the stress, from the eigenvalues of a 2 x 2 matrix.
-        const V8 mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11), radius = root(half * half + s01 * s01);
+        const V8 mean = 0.5 * (s.s00 + s.s11), half = 0.5 * (s.s00 - s.s11), radius = root(half * half + s.s01 * s.s01);
         const V8 most = mean + radius, least = mean - radius;
         const V8 high = most > zero ? most : zero, low = least > zero ? least : zero;
         const V8 centre = 0.5 * (high + low), slope = radius > zero ? 0.5 * (high - low) / (radius > zero ? radius : one) : zero;
-        const V8 t00 = centre + slope * half, t01 = slope * s01, t11 = centre - slope * half;
+        const V8 t00 = centre + slope * half, t01 = slope * s.s01, t11 = centre - slope * half;
         V8 b0[3], b1[3], pull0[3], pull1[3], ten0[3], ten1[3];
         for (int c = 0; c < 3; ++c) {
             b0[c] = load<V8>(e.shape + c * e.num_faces + i);
             b1[c] = load<V8>(e.shape + (3 + c) * e.num_faces + i);
             const V8 w0 = area * b0[c], w1 = area * b1[c];
-            pull0[c] = s00 * w0 + s01 * w1, pull1[c] = s01 * w0 + s11 * w1;
+            pull0[c] = s.s00 * w0 + s.s01 * w1, pull1[c] = s.s01 * w0 + s.s11 * w1;
             ten0[c] = t00 * w0 + t01 * w1, ten1[c] = t01 * w0 + t11 * w1;
         }
         for (int c = 0; c < 3; ++c) {
             for (int k = 0; k < 3; ++k) {
-                const V8 force = pull0[c] * s.f[0][k] + pull1[c] * s.f[1][k];
-                const V8 along = b0[c] * s.f[0][k], across = b1[c] * s.f[1][k];
-                const V8 turned = b0[c] * s.f[1][k] + b1[c] * s.f[0][k];
+                const V8 force = pull0[c] * f[0][k] + pull1[c] * f[1][k];
+                const V8 along = b0[c] * f[0][k], across = b1[c] * f[1][k];
+                const V8 turned = b0[c] * f[1][k] + b1[c] * f[0][k];
                 V8 roots[3] = {bulk * (along + across), soft * (along - across), soft * turned};
                 if (e.weave) {
                     roots[0] = weave.first * along + weave.coupled * across;
@@ -291,49 +247,27 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
     }
 }
 
-struct Hinge {
-    V8 per_unit, edge[3], a[3], b[3], n1[3], n2[3], length, edge_sq, n1_sq, n2_sq, angle;  // lengths in units of the rest length
-    I8 regular;
-};
-
-inline void hinge_of(const Engine& e, const double* pos, int64_t i, Hinge& h, V8* span) {
-    V8 x[4][3];
-    for (int c = 0; c < 4; ++c) gather(pos, e.hinge_corners + c * e.num_hinges + i, x[c]);
-    h.per_unit = 1.0 / load<V8>(e.rest_length + i);
-    for (int k = 0; k < 3; ++k) {
-        span[k] = x[1][k] - x[0][k];
-        h.edge[k] = span[k] * h.per_unit;
-        h.a[k] = (x[2][k] - x[0][k]) * h.per_unit;
-        h.b[k] = (x[3][k] - x[0][k]) * h.per_unit;
-    }
-    cross(h.edge, h.a, h.n1);
-    cross(h.b, h.edge, h.n2);
-    const V8 one = all(1.0), edge_sq = dot(h.edge, h.edge), n1_sq = dot(h.n1, h.n1), n2_sq = dot(h.n2, h.n2);
-    h.regular = regular(n1_sq, edge_sq * dot(h.a, h.a)) & regular(n2_sq, edge_sq * dot(h.b, h.b));
-    h.edge_sq = h.regular ? edge_sq : one;
-    h.n1_sq = h.regular ? n1_sq : one;
-    h.n2_sq = h.regular ? n2_sq : one;
-    h.length = root(h.edge_sq);
-    const V8 sine = h.regular ? -h.length * dot(h.n1, h.b) : all(0.0);
-    h.angle = angle_of(sine, h.regular ? dot(h.n1, h.n2) : one);
+// The hinge in units of its edge at rest; returns how many of them make a metre.
+inline V8 hinge_of(const Engine& e, const double* pos, int64_t i, V8 (*offset)[3], Hinge& h) {
+    offsets_of<4, 4>(pos, e.hinge_corners + i, e.num_hinges, offset);
+    const V8 per_unit = 1.0 / load<V8>(e.rest_length + i);
+    hinge_of(offset, per_unit, h);
+    return per_unit;
 }
 
 double hinge_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += LANES) {
         Hinge h;
-        V8 span[3];
-        hinge_of(e, pos, i, h, span);
-        const V8 weight = load<V8>(e.hinge_weight + i);
+        V8 offset[3][3];
+        const V8 per_unit = hinge_of(e, pos, i, offset, h), weight = load<V8>(e.hinge_weight + i);
         if (e.bending == 2) {
-            const V8 bend = h.angle * h.per_unit;
-            sum += total(0.5 * weight * bend * bend * dot(span, span));
+            sum += total(bending_energy(weight, h.angle * per_unit) * dot(offset[0], offset[0]));
         } else {
-            const V8 bend = bend_of(h.angle, load<V8>(e.rest_angle + i));
-            sum += total(0.5 * weight * bend * bend);
+            sum += total(bending_energy(weight, bend_of(h.angle, load<V8>(e.rest_angle + i))));
             if (!e.hinge_rate) continue;
             const V8 added = bend_of(h.angle, load<V8>(e.hinge_before + i));
-            sum += total(0.5 * load<V8>(e.hinge_rate + i) * weight * added * added);
+            sum += total(bending_energy(load<V8>(e.hinge_rate + i) * weight, added));
         }
     }
     return sum;
@@ -344,27 +278,18 @@ template <class T> void hinge_models(const Engine& e, const double* pos, Range r
     const V8 zero = all(0.0), one = all(1.0);
     for (int64_t i = range.begin; i < range.end; i += LANES) {
         Hinge h;
-        V8 span[3], slope[4][3];
-        hinge_of(e, pos, i, h, span);
-        const V8 scale = h.regular ? -h.length * h.per_unit : zero;
-        const V8 share_a = dot(h.edge, h.a) / h.edge_sq, share_b = dot(h.edge, h.b) / h.edge_sq;
-        const V8 by_a = scale / h.n1_sq, by_b = scale / h.n2_sq;
-        for (int k = 0; k < 3; ++k) {
-            const V8 at_a = by_a * h.n1[k], at_b = by_b * h.n2[k], at_end = -(share_a * at_a + share_b * at_b);
-            slope[0][k] = -at_a - at_b - at_end;
-            slope[1][k] = at_end;
-            slope[2][k] = at_a;
-            slope[3][k] = at_b;
-        }
+        V8 offset[3][3], slope[4][3];
+        const V8 per_unit = hinge_of(e, pos, i, offset, h), *edge = offset[0];
+        hinge_slopes(h, -h.length * per_unit, slope);
         V8 residual;
         if (e.bending == 2) {
-            const V8 length = root(dot(span, span)), ratio = length * h.per_unit;
+            const V8 length = root(dot(edge, edge)), ratio = length * per_unit;
             residual = h.angle * ratio;
-            const V8 along = h.angle * h.per_unit / (length > zero ? length : one);
+            const V8 along = h.angle * per_unit / (length > zero ? length : one);
             for (int k = 0; k < 3; ++k) {
                 for (int c = 0; c < 4; ++c) slope[c][k] *= ratio;
-                slope[0][k] -= along * span[k];
-                slope[1][k] += along * span[k];
+                slope[0][k] -= along * edge[k];
+                slope[1][k] += along * edge[k];
             }
         } else {
             residual = bend_of(h.angle, load<V8>(e.rest_angle + i));
@@ -622,7 +547,7 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     }
     Sums<double> faces, hinges;
     for_parts(e.parts, [&](int64_t part) {
-        if (e.membrane) faces[part] = e.weave ? woven_energy(e, pos, faces_of(e, part)) : face_energy(e, pos, faces_of(e, part));
+        if (e.membrane) faces[part] = (e.weave ? face_energy<weave_of> : face_energy<isotropic_of>)(e, pos, faces_of(e, part));
         if (e.bending) hinges[part] = hinge_energy(e, pos, hinges_of(e, part));
     });
     if (e.membrane) add(faces.total(e.parts));
