@@ -15,7 +15,7 @@ from hood.cloth.state import Attachments, State
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks, has_layers
-from hood.limits import CUT_UNSOUND
+from hood.limits import CUT_UNSOUND, DISTANCE_FAR
 from hood.mesh.closest_point.tree import forget_searches
 from hood.mesh.penetration.crossing import crossings
 from hood.rollouts.checks.guard import Guard
@@ -96,8 +96,8 @@ def simulate(
     changes nothing about it; its time is ``ms_metrics``, which ``ms_total`` leaves out as it does the caller's work. The same
     holds for ``fields``, names of :data:`FIELD_CHOICES`. The metrics of :class:`hood.rollouts.verdict.surface.SurfaceMeter`
     belong to every ``surface_stride``-th frame, the first and the last; other frames lack them. Those of
-    :func:`hood.rollouts.verdict.distance.distance_metrics` belong to every second of these and to the last; frame 0 lacks them:
-    no step led there.
+    :func:`hood.rollouts.verdict.distance.distance_metrics` belong to every second of these and to the last, and to the next
+    after one that is far beyond the limit; frame 0 lacks them: no step led there.
 
     A network that looks at a potential looks at ``potential``; a solver keeps its own.
 
@@ -140,7 +140,7 @@ def simulate(
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
     jumps = _jumps_within(scene, start_frame, count)
-    watch, cloth = Stopwatch(), scene.cloth
+    watch, cloth, far = Stopwatch(), scene.cloth, False
     for index in range(count):
         body_frame = start_frame + index
         state = recentre(state, scene.cloth.vertex_scene)
@@ -200,8 +200,9 @@ def simulate(
                 known_fields = {name: vertex_residual(known, figures.gradient).float().cpu() for name in fields}
                 if metrics == "all":
                     stepped |= figures.metrics()
-                    if _is_measured(index + 1, count, DISTANCE_EVERY * surface_stride):
+                    if far or _is_measured(index + 1, count, DISTANCE_EVERY * surface_stride):
                         stepped |= distance_metrics(potential, known, prediction.next_pos)
+                        far = not far and stepped["distance_p99"] > DISTANCE_FAR.value * scene.dt
         if observe is not None:
             with watch.aside("caller"):
                 observe(index + 1, known, prediction)

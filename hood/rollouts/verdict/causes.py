@@ -14,12 +14,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from hood.assets.files.said import Doubt
-from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND, DISTANCE_UNSOUND, GRADIENT_UNSOUND, STRAIN_UNSOUND, TOLERATED
+from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND, DISTANCE_FAR, DISTANCE_UNSOUND, GRADIENT_UNSOUND, STRAIN_UNSOUND, TOLERATED
 from hood.mesh.topology import unique_edges
 from hood.rollouts.checks.guard import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.rollouts.checks.step_repair import LEFT, NOT_TRIED
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.frames import Cause, FoundFrames, mask_of, name_frames
+from hood.rollouts.verdict.frames import Cause, FoundFrames, mask_of, name_frames, standing_for
 from hood.rollouts.verdict.skin import skin_causes
 from hood.rollouts.verdict.surface import Meshes, surface_metrics, visible, visible_crossings
 
@@ -51,19 +51,20 @@ def guard_doubts(data: RolloutData) -> FoundFrames:
 
 #: The metric of :mod:`hood.rollouts.verdict.distance`.
 DISTANCE = "distance_p99"
-#: Single steps beyond the limit are mended by the next ones: so often they are beyond it, or so far, where they count.
-_OFTEN, _FAR = 0.25, 2.0
+#: Steps beyond the limit are mended by the next ones: they count where more than one, and this share of the frames, is.
+_OFTEN = 0.25
 
 
 def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> FoundFrames:
     """Bad steps of ``dt`` [s], of every stepper by the distance [m] where it was measured: more than one step, and one in four,
-    beyond the limit, or one beyond twice as much. Elsewhere a solver is held to its target and, as a
+    beyond the limit, or one far beyond it. Elsewhere a solver is held to its target and, as a
     refinement, to the relative gradient; a network alone to nothing: its steps are no minima, and the force says little."""
     distance = metrics.get(DISTANCE)
     if distance is not None and np.isfinite(distance).any():
         limit, measured, way = DISTANCE_UNSOUND.value * dt, np.isfinite(distance), np.nan_to_num(distance)
-        often = (way > limit).sum() > max(_OFTEN * measured.sum(), 1)
-        bad = way > (limit if often else _FAR * limit)
+        over, known = way > limit, standing_for(measured, measured)
+        often = over.sum() > 1 and standing_for(over, measured).sum() > _OFTEN * known.sum()
+        bad = way > (limit if often else DISTANCE_FAR.value * dt)
         text = f"steps ended more than {1e3 * limit:.2g} mm from their minimum (p99 over the vertices)"
         return FoundFrames([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])
     found, converged, gradient = [], metrics.get("solver_converged"), _gradient(metrics)

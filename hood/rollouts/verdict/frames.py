@@ -49,14 +49,19 @@ class Cause:
     @property
     def spread(self) -> np.ndarray:
         """(S,) bool: bad frames, one that was measured standing for those up to the next."""
-        if self.measured is None or not self.measured.any():
-            return self.bad
-        last = np.maximum.accumulate(np.where(self.measured, np.arange(len(self.bad)), -1))
-        return np.asarray(np.where(last >= 0, self.bad[last.clip(0)], False))
+        return self.bad if self.measured is None else standing_for(self.bad, self.measured)
 
     def shown(self, value: float) -> str:
         """A value in words."""
         return format(self.shown_times * value, self.form) + self.shown_unit
+
+
+def standing_for(chosen: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """(S,) bool: where ``chosen`` (S,) holds in the last frame that was ``measured`` (S,) before or at each."""
+    if not measured.any():
+        return chosen
+    last = np.maximum.accumulate(np.where(measured, np.arange(len(chosen)), -1))
+    return np.asarray(np.where(last >= 0, chosen[last.clip(0)], False))
 
 
 @dataclass(frozen=True)

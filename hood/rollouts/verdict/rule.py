@@ -7,7 +7,8 @@ A rollout is unsound
 - with more than one bad frame, and more than 2% of all, or of those after the fifth where frame 0 was not at rest. A frame is
   bad where the cloth is torn, its step ended too far from the minimum, or skin or cloth come through the cloth.
   What is measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
-  Cloth that is torn to twice its length is judged in every frame, single ones as well; so is a limb that has gone through it.
+  Cloth that is torn to twice its length is judged in every frame, single ones as well. Of a limb that has gone through it, and
+  of skin through a fiftieth of it, one frame is enough.
 
 The numbers are those of :mod:`hood.limits`.
 """
@@ -21,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.limits import DEPTH_GROSS, SETTLING, STRAIN_TORN, TOLERATED
+from hood.limits import CUT_FLASH, DEPTH_GROSS, SETTLING, STRAIN_TORN, TOLERATED
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.causes import causes_of, strain_of, unknown_steps
 from hood.rollouts.verdict.frames import Cause, name_frames, runs_of, worst_frame
@@ -115,11 +116,15 @@ def _torn(strain: np.ndarray | None, count: int) -> np.ndarray:
     return np.asarray(np.nan_to_num(strain) > STRAIN_TORN.value)
 
 
+#: What is seen in a single frame, by the kind of its cause: a limb that has gone through the cloth, and skin all over it.
+_GROSS = {"skin_depth": DEPTH_GROSS, "skin_through_cloth": CUT_FLASH}
+
+
 def _is_gross(cause: Cause, judged: np.ndarray) -> bool:
-    """Whether a limb has gone through the cloth: one frame of that is seen."""
-    if cause.kind != "skin_depth" or cause.values is None:
+    """Whether one frame of it is seen."""
+    if cause.kind not in _GROSS or cause.values is None:
         return False
-    return bool((cause.values[cause.bad & judged] > DEPTH_GROSS.value).any())
+    return bool((cause.values[cause.bad & judged] > _GROSS[cause.kind].value).any())
 
 
 def _not_finite(finite: np.ndarray) -> Reason:

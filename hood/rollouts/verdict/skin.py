@@ -20,11 +20,11 @@ from hood.limits import (
 from hood.mesh.editing.repair import boundary_vertices
 from hood.mesh.penetration.crossing import Crossings, crossings
 from hood.mesh.topology import connected_components, hinges, unique_edges
-from hood.rollouts.verdict.frames import Cause, FoundFrames, name_frames
-from hood.rollouts.verdict.surface import Meshes, in_folds, sampled, spread_over, visible
+from hood.rollouts.verdict.frames import Cause, FoundFrames, name_frames, standing_for
+from hood.rollouts.verdict.surface import HARDLY, Meshes, in_folds, sampled, spread_over, visible
 
-#: Frames that are looked at from all sides, at most, of those in which a larger share of the cloth's triangles is cut.
-_LOOKED_AT, _HARDLY = 8, 0.001
+#: Frames that are looked at from all sides, at most, of those in which the skin cuts the cloth.
+_LOOKED_AT = 8
 #: How large spots of skin are, and in how many of the frames they then count.
 _LASTING = ((SPOTS_UNSOUND, SPOTS_LASTING), (SPOTS_LARGE, SPOTS_LARGE_LASTING))
 #: A thing turns by more than the first [rad] at an edge between two of its sides, and by less than the second within them;
@@ -45,15 +45,16 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
         inside: of the rollout, of which ``penetration_share`` says how many vertices are inside the body.
     """
     share, depth = metrics["cut_face_share"], metrics["skin_depth"]
-    measured = np.isfinite(share)
-    shown, spots, poked = (spread_over(values, measured) for values in _seen(share, meshes))
+    measured, cut_at_all = np.isfinite(share), np.nan_to_num(share)
+    shown, spots, poked = (spread_over(values, measured) for values in _seen(cut_at_all, meshes))
+    shown, spots = np.minimum(shown, cut_at_all), np.minimum(spots, cut_at_all)
     depth = np.where(measured, np.fmax(depth, poked), np.nan)
     height = np.nan_to_num(depth)
     cut, deep = shown > CUT_UNSOUND.value, (height > DEPTH_UNSOUND.value) & (shown > 0)
     lasting = np.zeros_like(measured)
     for size, share_of_frames in _LASTING:
         there = measured & (spots > size.value) & (height > SPOTS_HEIGHT.value)
-        lasting |= there & (there.sum() > share_of_frames.value * measured.sum())
+        lasting |= there & (standing_for(there, measured).mean() > share_of_frames.value)
     lasting &= ~deep
     causes = [
         Cause("skin_through_cloth", f"the skin is seen through more than {cut_text()} of the cloth's triangles", cut & measured,
@@ -86,11 +87,13 @@ def _seen(share: np.ndarray, meshes: Meshes) -> tuple[np.ndarray, np.ndarray, np
 
     NaN in frames that were not looked at, 0 in those whose skin cuts hardly anything.
     """
-    found = np.where(share <= _HARDLY, 0.0, np.nan)[None].repeat(3, axis=0)
+    found = np.where(share <= HARDLY, 0.0, np.nan)[None].repeat(3, axis=0)
     stored = {int(step): frame for frame, step in enumerate(meshes.step)}
-    over = [step for step in np.flatnonzero(np.nan_to_num(share) > _HARDLY).tolist() if step in stored]
-    for place in np.unique(np.linspace(0, max(len(over) - 1, 0), min(len(over), _LOOKED_AT)).astype(np.int64)).tolist():
-        found[:, over[place]] = _seen_at(meshes, stored[over[place]])
+    over = [step for step in np.flatnonzero(share > HARDLY).tolist() if step in stored]
+    if over:
+        places = np.unique(np.linspace(0, len(over) - 1, min(len(over), _LOOKED_AT)).astype(np.int64))
+        for step in {max(over, key=lambda step: share[step]), *(over[place] for place in places)}:
+            found[:, step] = _seen_at(meshes, stored[step])
     return found[0], found[1], found[2]
 
 
@@ -158,7 +161,7 @@ def _notes(metrics: Mapping[str, np.ndarray], share: np.ndarray, shown: np.ndarr
             f"the skin cuts up to {np.nanmax(folds):.1%} of the cloth's triangles where it passes through itself, in "
             f"{name_frames(caught)}: cloth cannot be outside both sides of such a fold, and this does not count"
         )
-    hidden = np.nan_to_num(share - folds) > CUT_UNSOUND.value
+    hidden = np.nan_to_num(share) - np.nan_to_num(folds) > CUT_UNSOUND.value
     if hidden.any() and not (shown[hidden] > CUT_UNSOUND.value).any():
         notes.append(
             f"the skin cuts up to {np.nanmax((share - folds)[hidden]):.1%} of the cloth's triangles in {name_frames(hidden)}, "

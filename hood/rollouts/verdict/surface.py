@@ -11,6 +11,7 @@ Skin through cloth and cloth through cloth in the frames of a rollout: what is s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -207,6 +208,8 @@ def _across(towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 #: Frames that are measured where the rollout has not, and in which places are looked at from all sides, at most.
 _MEASURED, _LOOKED_AT = 12, 4
+#: A share of the cloth's triangles that is hardly anything.
+HARDLY = 0.001
 #: Moments nearer [s] than this are the same.
 _SAME = 1e-6
 
@@ -254,22 +257,36 @@ def meshes_of(data: RolloutData) -> Meshes:
 
 def surface_metrics(data: RolloutData, meshes: Meshes) -> dict[str, np.ndarray]:
     """:data:`hood.rollouts.verdict.surface.SURFACE_METRICS` (S,) of the simulated frames, NaN where not measured; of a rollout
-    that measured none a dozen of its stored frames are, of those that were simulated."""
-    found = {name: data.step_metrics[name] for name in SURFACE_METRICS if name in data.step_metrics}
-    if "cut_face_share" in found and np.isfinite(found["cut_face_share"]).any():
-        return found
+    that measured none a dozen of its stored frames are, of those that were simulated. All stored frames between measured ones
+    are measured as well where the skin cuts the cloth in one of these: what comes through for a moment lies between them."""
     count = len(data.step_finite)
-    table = {name: np.full(count, np.nan) for name in SURFACE_METRICS}
+    table = {name: np.array(data.step_metrics.get(name, np.full(count, np.nan))) for name in SURFACE_METRICS}
     simulated = np.flatnonzero(np.abs(data.step_time[meshes.step] - data.time) < _SAME)
     if not len(simulated) or not len(meshes.faces):
         return table
     garment = Garment("", meshes.rest_pos, meshes.faces, np.zeros(len(meshes.rest_pos), dtype=bool), piece=meshes.piece)
     meter = SurfaceMeter(garment, meshes.body_faces)
-    places = np.unique(np.linspace(0, len(simulated) - 1, _MEASURED).astype(np.int64))
-    for frame in simulated[places].tolist():
-        for name, value in meter(meshes.cloth[frame], meshes.body[frame]).items():
-            table[name][meshes.step[frame]] = value
+
+    def measure(frames: np.ndarray) -> None:
+        for frame in frames.tolist():
+            for name, value in meter(meshes.cloth[frame], meshes.body[frame]).items():
+                table[name][meshes.step[frame]] = value
+
+    if not np.isfinite(table["cut_face_share"]).any():
+        measure(simulated[np.unique(np.linspace(0, len(simulated) - 1, _MEASURED).astype(np.int64))])
+    share = table["cut_face_share"]
+    cut = np.nan_to_num(share) - np.nan_to_num(table["cut_in_folds"]) > HARDLY
+    measure(simulated[_beside(np.isfinite(share), cut)[meshes.step[simulated]]])
     return table
+
+
+def _beside(measured: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(S,) bool: frames that were not ``measured`` (S,) between two that were, of which one is ``chosen`` (S,)."""
+    known = np.flatnonzero(measured)
+    beside = np.zeros(len(measured), dtype=bool)
+    for first, last in itertools.pairwise(known.tolist()):
+        beside[first + 1 : last] = chosen[first] or chosen[last]
+    return beside
 
 
 def visible_crossings(meshes: Meshes, counts: np.ndarray, most: float) -> dict[int, tuple[int, int]]:

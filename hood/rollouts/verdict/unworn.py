@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.said import Doubt
-from hood.limits import AWAY_UNSOUND, SLIPPED_UNSOUND, SUNK_SETTLING, SUNK_UNSOUND, TOLERATED
+from hood.limits import AWAY_UNSOUND, SHIFTED_UNSOUND, SLIPPED_UNSOUND, SUNK_SETTLING, SUNK_UNSOUND, TOLERATED
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.frames import Cause, FoundFrames
 from hood.rollouts.verdict.surface import Meshes
@@ -65,8 +65,13 @@ def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: in
     away, slipped = wear.away[:, part], wear.slipped[:, part]
     if not np.isfinite(away).any():
         return FoundFrames(doubts=[_not_worn_at_first(data, wear, part)])
-    sunk = wear.sunk[:, part]
-    off = (away > AWAY_UNSOUND.value) | (slipped > SLIPPED_UNSOUND.value) | (sunk > SUNK_UNSOUND.value)
+    ways = (
+        (away, AWAY_UNSOUND, "it is away from where it was on the body"),
+        (slipped, SLIPPED_UNSOUND, "its highest opening has slipped along the body"),
+        (wear.sunk[:, part], SUNK_UNSOUND, "its top has slid down the body"),
+        (wear.shifted[:, part], SHIFTED_UNSOUND, "it has shifted along the body"),
+    )
+    off = np.any([way > limit.value for way, limit, _ in ways], axis=0)
     # What has come off stays off; a film does not show a moment.
     if not (off[-1] or off.mean() > TOLERATED.value and off.sum() > 1):
         return FoundFrames()
@@ -76,11 +81,6 @@ def _of_part(data: RolloutData, meshes: Meshes, wear: Wear, part: int, count: in
     for place in np.flatnonzero(off).tolist():
         until = frames[place + 1] if place + 1 < len(frames) else count
         bad[frames[place] : until] = True
-    ways = (
-        (away, AWAY_UNSOUND, "it is away from where it was on the body"),
-        (slipped, SLIPPED_UNSOUND, "its highest opening has slipped along the body"),
-        (sunk, SUNK_UNSOUND, "its top has slid down the body"),
-    )
     beyond = [(float(np.nanmax(way)), way, limit, how) for way, limit, how in ways if (way > limit.value).any()]
     worst, way, limit, how = max(beyond, key=lambda one: one[0])
     values = np.full(count, np.nan)

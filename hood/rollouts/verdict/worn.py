@@ -1,6 +1,6 @@
 """Whether a garment stays where it was worn: each of its parts against the region of the body that it started on.
 
-Three lengths say so, of every part that is worn in frame 0:
+Four lengths say so, of every part that is worn in frame 0:
 
 - *away*: how much farther its vertices are from their region of the body than they were from the body in frame 0, the median
   over the vertices that touched it there, and over the nearest of them for a part without an opening around a limb: a cape
@@ -8,10 +8,12 @@ Three lengths say so, of every part that is worn in frame 0:
 - *slipped*: how far the highest opening around a limb has moved along the body: the way of the middle of the points of the body
   that are nearest to its vertices, on the body of frame 0. An opening with no limb in it any more counts as a metre;
 - *sunk*: how far its top has moved along the body towards where the feet are in frame 0, of a part with such an opening: a
-  waistband, or that shoulder of a dress which has moved farther. Clothes slide up by more in a handstand, and stay on.
+  waistband, or that shoulder of a dress which has moved farther. Clothes slide up by more in a handstand, and stay on;
+- *shifted*: how far its vertices that touched the body have moved along it, the median, of a part with such an opening: a dress
+  that winds round the trunk keeps its neckline where it was.
 
-The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; openings and tops
-are followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
+The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; for the last three
+lengths vertices are followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ from hood.mesh.topology import boundary_loops, connected_components, unique_edge
 #: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin, and openings
 #: and tops are followed so far.
 TOUCHES, _REGION, _FOLLOWED = 0.03, 0.15, 0.40
-#: Of an opening, and of a top, so many vertices are followed, at most.
-_OF_OPENING, _OF_TOP = 60, 30
+#: Of an opening, of a top, and of what touches the body, so many vertices are followed, at most.
+_OF_OPENING, _OF_TOP, _OF_TOUCHING = 60, 30, 60
 #: The top of a part is what touches the body so near [m] to its highest place that does: every connected piece of so many
 #: vertices, at least.
 _TOP, _LEAST_TOP = 0.06, 5
@@ -60,6 +62,7 @@ class Wear:
     away: np.ndarray  # (S, P) m
     slipped: np.ndarray  # (S, P) m
     sunk: np.ndarray  # (S, P) m
+    shifted: np.ndarray  # (S, P) m
     num_vertices: np.ndarray  # (P,) of each part
     first_vertex: np.ndarray  # (P,) the lowest of each part
     gap: np.ndarray  # (P,) m, between part and body in frame 0
@@ -97,11 +100,12 @@ class _Followed:
 
 @dataclass(frozen=True)
 class _Hold:
-    """What a part is held by: its highest opening around a limb, and the pieces of its top."""
+    """What a part is held by: its highest opening around a limb, the pieces of its top, and what touches the body."""
 
     rim: np.ndarray  # (R,) vertices along the opening
     opening: _Followed
     tops: list[_Followed]
+    touching: _Followed
 
     def slipped(self, pos: np.ndarray, body: np.ndarray) -> float:
         """How far the opening has moved along the body [m]."""
@@ -110,6 +114,10 @@ class _Hold:
     def sunk(self, pos: np.ndarray, body: np.ndarray) -> float:
         """How far that piece of the top has moved down the body which has moved farthest [m]; NaN without a top."""
         return max((-float(np.median(top.ways(pos, body)[:, 1])) for top in self.tops), default=np.nan)
+
+    def shifted(self, pos: np.ndarray, body: np.ndarray) -> float:
+        """How far what touches the body has moved along it [m]."""
+        return float(np.median(np.linalg.norm(self.touching.ways(pos, body), axis=1)))
 
 
 class WearMeter:
@@ -166,19 +174,21 @@ class WearMeter:
                 continue
             highest = max(rims, key=lambda rim: float(pos[rim, 1].mean()))
             tops = [follow(_some(top, _OF_TOP)) for top in _tops(pos, edges, own[dist[own] < TOUCHES])]
-            self._holds.append(_Hold(highest, follow(_some(highest, _OF_OPENING)), tops))
+            touching = follow(_some(rows, _OF_TOUCHING))
+            self._holds.append(_Hold(highest, follow(_some(highest, _OF_OPENING)), tops, touching))
 
-    def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """``away``, ``slipped`` and ``sunk`` (P,) [m] of one frame, see :class:`Wear`."""
+    def __call__(self, pos: np.ndarray, body_pos: np.ndarray) -> np.ndarray:
+        """``away``, ``slipped``, ``sunk`` and ``shifted`` (4, P) [m] of one frame, see :class:`Wear`."""
         body = self._points(body_pos)
-        away, slipped, sunk = np.full((3, len(self._touching)), np.nan)
+        away, slipped, sunk, shifted = found = np.full((4, len(self._touching)), np.nan)
         for number, (touching, hold) in enumerate(zip(self._touching, self._holds, strict=True)):
             if touching is not None:
                 away[number] = touching.away(pos, body)
             if hold is not None:
                 lost = num_through(pos[hold.rim], body_pos, self._body_edges) == 0
                 slipped[number], sunk[number] = _LOST if lost else hold.slipped(pos, body), hold.sunk(pos, body)
-        return away, slipped, sunk
+                shifted[number] = hold.shifted(pos, body)
+        return found
 
     def _points(self, body_pos: np.ndarray) -> np.ndarray:
         """Vertices of the body, and points on its edges where it is coarse."""
@@ -206,8 +216,8 @@ def measure_wear(
         return None
     meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces, pinned)
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
-    away, slipped, sunk = (np.array([row[which] for row in rows]) for which in range(3))
-    return Wear(np.asarray(frames), away, slipped, sunk, meter.num_vertices, meter.first_vertex, meter.gap)
+    ways = np.array(rows).swapaxes(0, 1)
+    return Wear(np.asarray(frames), *ways, meter.num_vertices, meter.first_vertex, meter.gap)
 
 
 def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:
