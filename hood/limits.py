@@ -46,7 +46,7 @@ STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more woul
 
 #: How far the 99th percentile of the vertices still had to go to the minimum of a step, over the time step: 25 mm at 30 fps.
 DISTANCE_UNSOUND = Limit(0.75, "m/s", _CAUSES, "of 374 rollouts the right ones, but for one, reach 0.68")
-DISTANCE_FAR = Limit(1.5, "m/s", _CAUSES, "one step beyond it is seen; a nearer one is mended by the next steps")
+DISTANCE_FAR = Limit(1.5, "m/s", _CAUSES, "one step beyond it is seen")
 #: Where no distance was measured: the unbalanced force over the weight.
 GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a coarse stand-in, wrong both ways by a factor of ten")
 
@@ -58,7 +58,7 @@ DEPTH_UNSOUND = Limit(0.01, "m", _SKIN, "skin that sticks out so far is seen fro
 DEPTH_GROSS = Limit(0.03, "m", _RULE, "a hand that has gone through the cloth: one frame is seen")
 SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _SKIN, "four of two thousand: smaller spots are not seen")
 SPOTS_HEIGHT = Limit(0.0015, "m", _SKIN, "lower spots flicker")
-SPOTS_LASTING = Limit(0.35, "share of frames", _SKIN, "spots that come and go are not seen; right rollouts have them in 0.21")
+SPOTS_LASTING = Limit(0.35, "share of frames", _SKIN, "spots that come and go are not seen")
 #: Larger spots count where they last less long.
 SPOTS_LARGE = Limit(
     0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: good ones have them in one frame looked at, at most"

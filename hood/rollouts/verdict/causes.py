@@ -14,7 +14,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from hood.assets.files.said import Doubt
-from hood.limits import CROSSINGS_SEEN, CROSSINGS_UNSOUND, DISTANCE_FAR, DISTANCE_UNSOUND, GRADIENT_UNSOUND, STRAIN_UNSOUND, TOLERATED
+from hood.limits import (
+    CROSSINGS_SEEN,
+    CROSSINGS_UNSOUND,
+    DISTANCE_FAR,
+    DISTANCE_UNSOUND,
+    GRADIENT_UNSOUND,
+    STRAIN_UNSOUND,
+    TOLERATED,
+)
 from hood.mesh.topology import unique_edges
 from hood.rollouts.checks.guard import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.rollouts.checks.step_repair import LEFT, NOT_TRIED

@@ -12,8 +12,9 @@ Four lengths say so, of every part that is worn in frame 0:
 - *shifted*: how far its vertices that touched the body have moved along it, the median, of a part with such an opening: a dress
   that winds round the trunk keeps its neckline where it was.
 
-The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; for the last three
-lengths vertices are followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers around the ankles do not.
+The region of a vertex are the points of the body within 15 cm, along the skin, of its nearest one in frame 0; for the last
+three lengths vertices are followed for 40 cm. Swinging hems, open jackets and crossed arms stay near their regions; trousers
+around the ankles do not.
 """
 
 from __future__ import annotations
@@ -216,8 +217,8 @@ def measure_wear(
         return None
     meter = WearMeter(pos[0].astype(np.float64), faces, body_pos[0].astype(np.float64), body_faces, pinned)
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
-    ways = np.array(rows).swapaxes(0, 1)
-    return Wear(np.asarray(frames), *ways, meter.num_vertices, meter.first_vertex, meter.gap)
+    away, slipped, sunk, shifted = np.array(rows).swapaxes(0, 1)
+    return Wear(np.asarray(frames), away, slipped, sunk, shifted, meter.num_vertices, meter.first_vertex, meter.gap)
 
 
 def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:

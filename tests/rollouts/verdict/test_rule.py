@@ -112,6 +112,16 @@ def test_the_distance_decides_where_it_was_measured() -> None:
     assert refined(distance_p99=np.where(np.isfinite(measured), 0.04, np.nan)).sound is False
 
 
+def test_a_far_step_is_one_frame_where_the_next_was_measured() -> None:
+    measured = np.where(np.arange(30) % 10 == 0, 0.001, np.nan)
+    measured[10] = 0.11
+    assert refined(distance_p99=measured).sound is False
+    measured[11] = 0.015
+    assert refined(distance_p99=measured).sound
+    measured[11] = 0.04  # still beyond, up to the next that was measured: more than a quarter of the frames
+    assert refined(distance_p99=measured).sound is False
+
+
 def test_the_limit_of_the_distance_goes_with_the_time_step() -> None:
     for fps, sound in ((30.0, True), (120.0, False)):
         data = stored(30, {"strain_p99": frames(30), "distance_p99": steps(30, 0.02)})

@@ -65,6 +65,18 @@ def test_a_waistband_that_slips_by_a_hand_has_come_off() -> None:
     assert off(rollout(np.linspace(SLEEVE, turned, COUNT))) == []  # around the post
 
 
+def test_a_sleeve_that_winds_around_its_post_is_not_worn() -> None:
+    """The post is as thick as a trunk. The sleeve's top stays, and what lies below turns the more the lower it is."""
+    sleeve, post = SLEEVE * [1.5, 1.0, 1.5], POST * [1.5, 1.0, 1.5]
+    share = (SLEEVE[:, 1].max() - SLEEVE[:, 1]) / np.ptp(SLEEVE[:, 1])
+    for most, worn in ((100.0, True), (300.0, False)):
+        turns = [np.radians(degrees) * share for degrees in np.linspace(0.0, most, COUNT)]
+        wound = [Rotation.from_rotvec(np.outer(turn, [0.0, 1.0, 0.0])).apply(sleeve) for turn in turns]
+        found = off(rollout(np.array(wound), body=post))
+        assert (not found) is worn
+        assert worn or "it has shifted along the body, by 0." in found[0].sentence
+
+
 def test_a_strap_that_slides_down_has_come_off() -> None:
     """Two straps stand up from a sleeve: one stays, and the opening with it, in the mean."""
     above = SLEEVE[:, 1] > 1.1
