@@ -106,6 +106,27 @@ def rim_length(pos: np.ndarray, rim: np.ndarray) -> float:
     return float(np.linalg.norm(pos[rim] - np.roll(pos[rim], 1, axis=0), axis=1).sum())
 
 
+def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:
+    """How many edges of the body go through the fan of triangles between an opening (N, 3) [m] and its middle."""
+    start, end = body_pos[body_edges[:, 0]], body_pos[body_edges[:, 1]]
+    near = (np.minimum(start, end) <= rim.max(axis=0)).all(axis=1) & (np.maximum(start, end) >= rim.min(axis=0)).all(axis=1)
+    start, way = start[near], (end - start)[near]
+    if not len(start):
+        return 0
+    middle = rim.mean(axis=0)
+    first, second = rim - middle, np.roll(rim, -1, axis=0) - middle  # sides of the triangles, (N, 3)
+    normal = np.cross(first, second)
+    slope = way @ normal.T  # (E, N)
+    from_middle = start - middle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = -(from_middle @ normal.T) / slope
+        crossed = np.cross(way, from_middle)
+        u = (crossed @ second.T) / slope
+        v = -(crossed @ first.T) / slope
+        hit = (along >= 0.0) & (along <= 1.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    return int(hit.any(axis=1).sum())
+
+
 #: Of the cloth around its nearest triangle a rigid thing follows what lies within its own reach and this [m], so many vertices.
 _AROUND, _MOST = 0.01, 24
 

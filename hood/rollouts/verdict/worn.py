@@ -27,7 +27,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from hood.mesh.parts import rim_length
+from hood.mesh.parts import num_through, rim_length
 from hood.mesh.topology import boundary_loops, connected_components, unique_edges
 
 #: A vertex nearer than this [m] to the body touches it; the region of a vertex reaches so far [m] along the skin, and openings
@@ -219,27 +219,6 @@ def measure_wear(
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
     away, slipped, sunk, shifted = np.array(rows).swapaxes(0, 1)
     return Wear(np.asarray(frames), away, slipped, sunk, shifted, meter.num_vertices, meter.first_vertex, meter.gap)
-
-
-def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:
-    """How many edges of the body go through the fan of triangles between an opening (N, 3) [m] and its middle."""
-    start, end = body_pos[body_edges[:, 0]], body_pos[body_edges[:, 1]]
-    near = (np.minimum(start, end) <= rim.max(axis=0)).all(axis=1) & (np.maximum(start, end) >= rim.min(axis=0)).all(axis=1)
-    start, way = start[near], (end - start)[near]
-    if not len(start):
-        return 0
-    middle = rim.mean(axis=0)
-    first, second = rim - middle, np.roll(rim, -1, axis=0) - middle  # sides of the triangles, (N, 3)
-    normal = np.cross(first, second)
-    slope = way @ normal.T  # (E, N)
-    from_middle = start - middle
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = -(from_middle @ normal.T) / slope
-        crossed = np.cross(way, from_middle)
-        u = (crossed @ second.T) / slope
-        v = -(crossed @ first.T) / slope
-        hit = (along >= 0.0) & (along <= 1.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
-    return int(hit.any(axis=1).sum())
 
 
 def _to_follow(

@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stored import frames, stored, tube
 
+from hood.mesh.parts import num_through
 from hood.mesh.topology import unique_edges
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.rule import Reason, judge_rollout
-from hood.rollouts.verdict.worn import measure_wear, num_through
+from hood.rollouts.verdict.worn import measure_wear
 
 POST, POST_FACES = tube(0.10, 0.0, 1.6, 24, 60)
 SLEEVE, SLEEVE_FACES = tube(0.115, 0.8, 1.2)
