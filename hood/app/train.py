@@ -211,7 +211,8 @@ def _start_from(simulator: NetworkStepper, name: str, fps: float) -> int:
     path = locate("weights", name)
     given = load_stepper(path, fps)
     way_out = f"give the model= that weights={name} were trained as"
-    require_same_model(path, given, simulator, way_out, free=("coarse_edge",))  # no weight depends on which levels are taken
+    # No weight depends on which levels are taken, nor on how statistics would go on.
+    require_same_model(path, given, simulator, way_out, free=("coarse_edge", "normalizer_decay"))
     simulator.load_state_dict(given.state_dict())
     return 0 if path.suffix.lower() in SUFFIXES else int(read_header(path).get("iteration", 0))
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from reference_oracle import make_state
 from torch import Tensor
 
 from hood.app.notices import collected
@@ -19,6 +21,7 @@ from hood.cli.main import main
 from hood.energies.mass_points import Gravity
 from hood.energies.problem import StepProblem
 from hood.steppers.checkpoint import read_header
+from hood.steppers.published import import_reference_weights
 from hood.training.trainer import Trainer
 
 SMALL = ["model.latent_dim=8", "data.garments=[tank]"]
@@ -154,6 +157,18 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
 def test_given_weights_may_go_on_with_other_levels() -> None:
     begun = trainer("model=edges", "model.schedule=ours", "model.latent_dim=48", "model.coarse_edge=0.04", "weights=edges")
     assert begun.simulator.config["coarse_edge"] == 0.04
+
+
+def test_published_weights_go_on_as_they_were_trained(tmp_path: Path) -> None:
+    """Their statistics come along and stay: how new ones would be averaged is no part of the model."""
+    weights = tmp_path / "postcvpr.pth"
+    state = make_state("postcvpr", 8)
+    torch.save(state, weights)
+    begun = trainer("experiment=released", f"weights={weights}", f"output={tmp_path}/run")
+    held = import_reference_weights(state)[0].state_dict()
+    assert all(value.equal(held[name]) for name, value in begun.simulator.state_dict().items())
+    assert "parameter_gradient_norm" in begun.update()
+    assert all(value.equal(held[name]) for name, value in begun.simulator.named_buffers() if name in held)
 
 
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
