@@ -102,7 +102,7 @@ def test_larger_spots_count_where_they_last_less_long() -> None:
     assert judge_rollout(worn(sometimes, 3)).sound  # 0.3% of the triangles
     (reason,) = judge_rollout(worn(sometimes, 6)).reasons  # 0.6%
     assert (reason.kind, reason.frames) == ("skin_depth", ((11, 15),))
-    assert judge_rollout(worn(np.where(np.arange(COUNT) > 11, 0.0115, 0.0), 6)).sound  # a quarter, and no more
+    assert judge_rollout(worn(np.where(np.arange(COUNT) > 12, 0.0115, 0.0), 6)).sound  # three of sixteen frames
 
 
 def test_a_corner_between_the_vertices_of_the_cloth_is_no_spot() -> None:
