@@ -153,18 +153,19 @@ def _cut_off(count: int, faces: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray
 
 def _notes(metrics: Mapping[str, np.ndarray], share: np.ndarray, shown: np.ndarray) -> list[str]:
     """What was cut and does not count."""
-    folds = metrics.get("cut_in_folds", np.zeros_like(share))
-    caught = np.nan_to_num(folds) > CUT_UNSOUND.value
+    folds = np.nan_to_num(metrics["cut_in_folds"])  # older files have none
+    caught = folds > CUT_UNSOUND.value
     notes = []
     if caught.any():
         notes.append(
-            f"the skin cuts up to {np.nanmax(folds):.1%} of the cloth's triangles where it passes through itself, in "
+            f"the skin cuts up to {folds.max():.1%} of the cloth's triangles where it passes through itself, in "
             f"{name_frames(caught)}: cloth cannot be outside both sides of such a fold, and this does not count"
         )
-    hidden = np.nan_to_num(share) - np.nan_to_num(folds) > CUT_UNSOUND.value
+    apart = np.nan_to_num(share) - folds
+    hidden = apart > CUT_UNSOUND.value
     if hidden.any() and not (shown[hidden] > CUT_UNSOUND.value).any():
         notes.append(
-            f"the skin cuts up to {np.nanmax((share - folds)[hidden]):.1%} of the cloth's triangles in {name_frames(hidden)}, "
+            f"the skin cuts up to {apart.max():.1%} of the cloth's triangles in {name_frames(hidden)}, "
             "where no viewer sees it: this does not count"
         )
     return notes

@@ -9,8 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stored import frames, stored, tube
 
-from hood.mesh.parts import num_through
-from hood.mesh.topology import unique_edges
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.verdict.rule import Reason, judge_rollout
 from hood.rollouts.verdict.worn import measure_wear
@@ -173,22 +171,3 @@ def test_files_without_settings_are_judged_as_well() -> None:
         assert off(data)
     data.attributes["config"] = json.dumps({"worn": False})
     assert off(data) == []
-
-
-def test_edges_through_an_opening_are_counted_as_by_volumes() -> None:
-    """An edge goes through a triangle where its ends are on both sides and it passes the three sides the same way round."""
-    rng = np.random.default_rng(3)
-    rim = tube(0.3, 0.0, 0.1, 9, 1)[0][:9] + rng.normal(0, 0.02, (9, 3))
-    points = rng.uniform(-0.4, 0.4, (60, 3))
-    edges = unique_edges(rng.integers(0, 60, (200, 3)))
-    middle, expected = rim.mean(axis=0), 0
-    for start, end in points[edges]:
-        through = False
-        for first, second in zip(rim, np.roll(rim, -1, axis=0), strict=True):
-            corners = [middle, first, second]
-            sides = [np.linalg.det(np.stack([b - a for b in (*corners[1:], p)])) for p in (start, end) for a in [corners[0]]]
-            around = [np.linalg.det(np.stack([end - start, corners[k] - start, corners[k - 2] - start])) for k in range(3)]
-            through |= bool(np.prod(np.sign(sides)) < 0 and abs(np.sign(around).sum()) == 3)
-        expected += through
-    assert expected > 20
-    assert num_through(rim, points, edges) == expected
