@@ -53,7 +53,7 @@ GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a coarse stand-in,
 #: Skin through cloth, apart from folds of the skin.
 CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _SKIN, "pictures show ten of a thousand triangles")
 CUT_FLASH = Limit(0.02, "share of the cloth's triangles", _RULE, "seen in a single frame; right rollouts show 1.0%")
-CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "the worst of 28 ordinary rollouts is 1.4%")
+CUT_ALARM = Limit(0.02, "share of the cloth's triangles", _GUARD, "28 ordinary rollouts reach 0.42% at most")
 DEPTH_UNSOUND = Limit(0.01, "m", _SKIN, "skin that sticks out so far is seen from every side")
 DEPTH_GROSS = Limit(0.03, "m", _RULE, "a hand that has gone through the cloth: one frame is seen")
 SPOTS_UNSOUND = Limit(0.002, "share of the cloth's triangles", _SKIN, "four of two thousand: smaller spots are not seen")

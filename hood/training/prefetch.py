@@ -1,4 +1,4 @@
-"""Scenes made ahead: garment, body surfaces and settled start of the next rollout, in worker processes while the model trains.
+"""Scenes made ahead: garment, body surfaces and settled start of the next rollout, with its noise, in worker processes.
 
 A scene is a function of its request alone, so who makes it, and when, changes nothing: a run with workers, without, or
 resumed with another number of them sees the same scenes to the last bit.

@@ -70,7 +70,8 @@ class SceneSampler:
         uniform: properties of the fabric that are drawn uniformly; the others are log-uniform.
         still_fraction: share of the rollouts of one step whose step is a regular one with a still body, not the relaxing one.
         by_centroids: scenes begin as by :func:`hood.scene.start.leave_by_centroids`, not settled.
-        noise: standard deviation [m] of normal noise on every coordinate of x_t and of x_{t−1} at the start, independent.
+        noise: standard deviation [m] of normal noise on every coordinate of x_t and of x_{t−1} at the start, independent;
+            :func:`hood.training.prefetch.make_start` adds it.
         noise_on_pinned: pinned vertices have it as well.
         device: where the scenes' tensors live in training.
 

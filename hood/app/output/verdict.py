@@ -82,7 +82,7 @@ def surface_warnings(surface: Mapping[str, Any]) -> list[str]:
     if cut["worst"] > WORST_CUT:
         lines.append(
             f"warning: the body's skin cuts {cut['worst']:.1%} of the cloth's triangles in frame {cut['frame']}; "
-            "pictures show it"
+            "the verdict counts what a viewer sees of it"
         )
     for key, what in (("self_crossings", "the cloth"), ("garment_crossings", "two garments")):
         worst = surface[key]

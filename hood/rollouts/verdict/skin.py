@@ -36,9 +36,9 @@ def skin_causes(metrics: Mapping[str, np.ndarray], inside: Mapping[str, np.ndarr
     """Skin through cloth.
 
     A frame is bad where the skin that a viewer sees cuts more than 1% of the cloth's triangles, or sticks out by more than a
-    centimetre. Spots of some millimetres are seen where they stay: they count if a third of the frames has them, or a
-    fifth of the frames larger ones, and not where a corner of a thing comes through between the vertices of the cloth.
-    Triangles caught in a fold of the skin do not count.
+    centimetre. Spots of some millimetres are seen where they stay: they count if more than ``SPOTS_LASTING`` of the
+    frames have them, or ``SPOTS_LARGE_LASTING`` larger ones, and not where a corner of a thing comes through between the
+    vertices of the cloth. Triangles caught in a fold of the skin do not count.
 
     Args:
         metrics: of the surface, (S,) each.

@@ -27,7 +27,7 @@ def test_worst_frames_are_named_and_warned_about() -> None:
     assert describe_surface(found) == [
         "surface (one frame in 2, first and last): the body cuts 6.2% of the cloth's triangles on average, 12.6% in frame 2, "
         "skin at most 12.6 mm above the cloth, 2.0 pairs of triangles of one garment pass through each other on average",
-        "warning: the body's skin cuts 12.6% of the cloth's triangles in frame 2; pictures show it",
+        "warning: the body's skin cuts 12.6% of the cloth's triangles in frame 2; the verdict counts what a viewer sees of it",
         "warning: 5 pairs of triangles of the cloth pass through each other in frame 3",
     ]
     assert cut_at_worst(found) == "skin cuts 12.6% at worst"
