@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -40,13 +41,14 @@ class GivenUpError(Exception):
     """A process that torchrun started ends, and has said why."""
 
 
-def together(command: Callable[[], Result]) -> Result:
-    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once.
+def together(command: Callable[[], Result], patience: timedelta = distributed.UNEQUAL) -> Result:
+    """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once. No process
+    waits longer than ``patience`` for another.
 
     Raises:
         GivenUpError: instead of another process's ValueError, OSError or ImportError.
     """
-    distributed.start()
+    distributed.start(patience)
     try:
         return command()
     except (ValueError, OSError, ImportError) as error:
@@ -241,7 +243,17 @@ def tell_choice(choice: KernelChoice) -> None:
 
 
 def require_device(config: Settings) -> None:
-    """Raise ConfigError unless ``config.device`` is known and present."""
+    """Raise ConfigError unless ``config.device`` is known and present; with ``cuda`` this process takes the GPU of its rank.
+
+    Raises:
+        ConfigError: no GPU, or torchrun started more processes on this machine than it has GPUs.
+    """
     require_choice(config, "device", ("cpu", "cuda"))
-    if str(config.device) == "cuda" and not torch.cuda.is_available():
+    if str(config.device) != "cuda":
+        return
+    if not torch.cuda.is_available():
         raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")
+    gpus, processes = torch.cuda.device_count(), distributed.processes_here()
+    if processes > gpus:
+        raise ConfigError(f"device=cuda: {processes} processes and {gpus} GPU{'s' * (gpus > 1)} here; --nproc-per-node {gpus}")
+    torch.cuda.set_device(distributed.rank_here())

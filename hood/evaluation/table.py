@@ -50,7 +50,7 @@ def measured_radius(simulator: NetworkStepper, seed: int = 0) -> int:
     coarsest among them. The farthest path of a multi-level schedule may start on any level. Of a network of several passes it
     is the reach of all its steps together; what the potential tells it between two passes is not counted.
     """
-    network = copy.deepcopy(simulator.network).double().eval()
+    network = copy.deepcopy(simulator.network).cpu().double().eval()
     network.use_precision("fp32")  # of products in float64: as they come
     network.use_kernels("torch")
     columns = simulator.velocity_columns

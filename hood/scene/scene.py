@@ -118,20 +118,26 @@ class Scene:
             TangledError: triangles of two garments still pass through each other.
         """
         obstacle = self.motion.obstacle(frame, state.origin[0].numpy(), static=True)
-        outfit, found, pos = self.outfit, None, state.pos
+        outfit, cloth, pos, found = self.outfit, self.cloth, state.pos, None
+        device = pos.device
+        if device.type != "cpu":  # the searches for what passes through what are on the host
+            cloth, pos = to_device(cloth, "cpu"), pos.cpu()
+            obstacle = None if obstacle is None else to_device(obstacle, "cpu")
+            outfit = None if outfit is None else outfit._replace(cloth=cloth)
+        given = pos
         if outfit is None:
-            pos = smooth_out(self.cloth, self.garment.faces, pos, obstacle, self.clearance)
+            pos = smooth_out(cloth, self.garment.faces, pos, obstacle, self.clearance)
         else:
             pos = self._each_smoothed(outfit, pos, obstacle)
             found = separate(outfit, pos, obstacle, self.clearance, self.layers)
             pos = found.pos
-        return (state if pos is state.pos else State(pos, state.vel, state.origin)), found
+        return (state if pos is given else State(pos.to(device), state.vel, state.origin)), found
 
     def _each_smoothed(self, outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> Tensor:
         """Garment by garment: where one passes through another nothing is smoothed."""
         garment = outfit.piece[outfit.faces[:, 0]]
         for number in range(len(outfit.names)):
-            pos = smooth_out(self.cloth, outfit.faces[garment == number], pos, obstacle, self.clearance)
+            pos = smooth_out(outfit.cloth, outfit.faces[garment == number], pos, obstacle, self.clearance)
         return pos
 
     def _require_worn(self, frame: int, skinned: Tensor, settled: Tensor) -> None:

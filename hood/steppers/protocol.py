@@ -197,7 +197,7 @@ class Stopwatch:
 
 
 def _wait() -> None:
-    if torch.cuda.is_available():
+    if torch.cuda.is_initialized():  # where nothing was computed on a GPU there is nothing to wait for
         torch.cuda.synchronize()
 
 

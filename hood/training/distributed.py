@@ -16,18 +16,19 @@ from torch.nn.parallel import DistributedDataParallel
 Result = TypeVar("Result")
 
 #: Shares of a batch of rollouts may differ by hours: the one that is done first waits.
-_PATIENCE = timedelta(days=7)
+UNEQUAL = timedelta(days=7)
+#: Updates of a training take as long on every process: who waits so long for another one waits for nothing.
+EQUAL = timedelta(hours=1)
 _TOLD = "raised on process 0"
 
 
-def start() -> None:
-    """Join the process group when torchrun started this process; otherwise do nothing."""
+def start(patience: timedelta = UNEQUAL) -> None:
+    """Join the process group when torchrun started this process; otherwise do nothing. A process that waits longer than
+    ``patience`` for the others ends with an error."""
     if "WORLD_SIZE" in os.environ and int(os.environ["WORLD_SIZE"]) > 1 and not dist.is_initialized():
-        if torch.cuda.is_available():
-            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
         # Flags and slots are exchanged on the CPU in any case, gradients where the model is.
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-        dist.init_process_group(backend, timeout=_PATIENCE)
+        dist.init_process_group(backend, timeout=patience)
 
 
 def stop() -> None:
@@ -44,6 +45,16 @@ def rank() -> int:
 def is_first() -> bool:
     """Whether this is process 0, also before it has joined the others."""
     return int(os.environ.get("RANK", "0")) == 0 if not dist.is_initialized() else rank() == 0
+
+
+def processes_here() -> int:
+    """Number of processes on this machine, 1 when alone; also before they have joined."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+
+
+def rank_here() -> int:
+    """Number of this process on this machine, 0 when alone; also before it has joined the others."""
+    return int(os.environ.get("LOCAL_RANK", "0"))
 
 
 def world_size() -> int:

@@ -212,7 +212,7 @@ class Slots:
             if slot.length is not None:
                 entry["length"] = slot.length
             if slot.state is not None and slot.window is not None:
-                entry |= {"pos": slot.state.pos, "vel": slot.state.vel, "origin": slot.state.origin}
+                entry |= {"pos": slot.state.pos.cpu(), "vel": slot.state.vel.cpu(), "origin": slot.state.origin}
             entries[index] = entry
         return entries
 

@@ -180,7 +180,9 @@ SIZES = {
 }
 
 
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in list(SIZES)[:-2]), *list(SIZES)[-2:]]
+)
 def test_another_size_comes_back_too(capsys: pytest.CaptureFixture[str], name: str) -> None:
     assert bring_back(SIZES[name], capsys)[0] == "right"
 
@@ -230,7 +232,9 @@ def test_prepare_resizes_nothing_unasked(capsys: pytest.CaptureFixture[str]) -> 
     assert resized == pytest.approx(float(scale.removeprefix("scale=")), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", [*GARMENTS, "shorts"])
+@pytest.mark.parametrize(
+    "name", ["tshirt", *(pytest.param(name, marks=pytest.mark.slow) for name in (*GARMENTS[1:], "shorts"))]
+)
 @pytest.mark.parametrize("factor", [0.96, 1.0, 1.05])
 def test_a_cut_that_is_a_little_wider_or_tighter_keeps_its_size(body: Body, name: str, factor: float) -> None:
     garment, pos, _ = truth(Case(name))

@@ -111,6 +111,7 @@ SLOW = (
     (r"^train weights=quickstart model=", "weights to start from, as by experiment=quickstart"),
     (r"^plan garment=dress sequence", "the scene of a plan, as of hood plan alone"),
     (r"^sizes garment=dress output", "another garment"),
+    (r"^tradeoff", "the chart, which has tests of its own"),
     (r"^(inspect|prepare) .*my_shirt\.obj( my_walk\.npz)?$", "files of another name"),
 )
 #: Commands that are told which files to read; their bare names, as the text has them, ask for those.

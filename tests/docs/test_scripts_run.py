@@ -82,7 +82,9 @@ RUN = (
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
-    Run(r"levels\.py", "--garments tank_4k --sequences plie --frames 3", r"mesh tank(.|\n)*60 fps(.|\n)*of 1 meshes"),
+    Run(
+        r"levels\.py", "--garments tank_4k --sequences plie --frames 3", r"mesh tank(.|\n)*60 fps(.|\n)*of 1 meshes", slow=True
+    ),
     Run(r"stopping\.py", "--scenes tank_plie --frames 6 --states 2", r"2 states of tank_plie(.|\n)*8 iterations"),
     Run(r"starts\.py", "--models quickstart --states 1 --kernels torch", r"lower of quickstart", slow=True),
     Run(

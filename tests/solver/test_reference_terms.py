@@ -119,7 +119,7 @@ def test_bending_matrix_is_that_of_a_least_squares_residual() -> None:
 
 @pytest.mark.parametrize("form", POTENTIALS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-@pytest.mark.parametrize("linear_solver", ["cg", "direct"])
+@pytest.mark.parametrize("linear_solver", ["cg", pytest.param("direct", marks=pytest.mark.slow)])
 def test_a_sheet_on_a_sphere_converges(dtype: torch.dtype, linear_solver: str, form: str) -> None:
     problem, potential = sheet_on_sphere(dtype), POTENTIALS[form]
     settings = NewtonSettings(target_rg=1e-3, max_iterations=30, linear=linear_solver)

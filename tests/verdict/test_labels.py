@@ -70,7 +70,11 @@ def test_the_fast_scenes_are_of_many_kinds_and_half_of_them_broken() -> None:
     assert Counter(LABELS[name]["label"] for name in FAST) == {"right": 10, "broken": 10}
 
 
-@pytest.mark.parametrize("scenes", [SCENES, SECOND, THIRD, REFUSED], ids=["first", "second", "third", "refused"])
+@pytest.mark.parametrize(
+    "scenes",
+    [SCENES, *(pytest.param(scenes, marks=pytest.mark.slow) for scenes in (SECOND, THIRD)), REFUSED],
+    ids=["first", "second", "third", "refused"],
+)
 def test_every_scene_is_asked_for_in_keys_of_today(scenes: dict[str, Scene]) -> None:
     asked = {(*STEPPERS[scene.stepper], f"num_frames={scene.frames}", *scene.keys) for scene in scenes.values()}
     for told in asked:

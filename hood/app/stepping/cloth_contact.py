@@ -103,8 +103,6 @@ def _hindrance(config: RolloutSettings, potential: Potential | None = None) -> s
         return f"refine={{method:{method},…}} moves vertices through cloth; use method:newton"
     if str(config.step) != "plain":
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
-    if mode == "auto" and str(config.device) != "cpu":
-        return "its search is done on the CPU, between steps on another device; cloth_contact=on does so"
     terms = (potential or losses_of(config)).terms
     if mode == "auto" and _are_published(terms):
         return "losses=… are those of published code, which has none; cloth_contact=on adds it"

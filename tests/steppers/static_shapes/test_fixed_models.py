@@ -116,7 +116,7 @@ def make(kind: str) -> NetworkStepper:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["skirt_scene", "tank_scene"])
+@pytest.mark.parametrize("name", ["skirt_scene", pytest.param("tank_scene", marks=pytest.mark.slow)])
 def test_every_kind_of_model_has_such_a_step(kind: str, name: str, request: pytest.FixtureRequest) -> None:
     """With pins and without, with springs of buttons, and without a body."""
     scene: Scene = request.getfixturevalue(name)

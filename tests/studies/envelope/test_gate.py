@@ -24,7 +24,16 @@ from hood.steppers.newton import NewtonStepper
 from hood.studies.envelope.judge import CLASSES, SILENT, SOUND
 
 #: Cells in which no method holds, and which take as long as six others.
-SLOW = ("stretching-x0.01", "density-5-kg-m")
+SLOW = (
+    "stretching-x0.01",
+    "density-5-kg-m",
+    "stretching-x1000",
+    "size-x0.7",
+    "friction-10",
+    "gravity-3-g",
+    "bending-x100",
+    "dt-1-10",
+)
 RECORDED = json.loads(Path(__file__).with_name("gate_classes.json").read_text(encoding="utf-8"))
 
 

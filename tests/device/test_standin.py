@@ -1,0 +1,105 @@
+"""hood on a stand-in for a GPU: the positions are the CPU's, nothing waits inside a recorded frame, and launches only fall.
+
+The stand-in (:mod:`standin`) is torch's PrivateUse1 device over ordinary memory. It takes a process of its own, because torch
+can rename that device once, and because hood is imported otherwise there.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hood.native.build import BuildError, find_compiler
+
+HERE = Path(__file__).parent
+#: Rollouts: most that vertices may be apart [m], operations that make the host wait in the whole rollout of three steps, and
+#: operations on the device of all recorded graphs. The numbers may fall, not rise.
+FAST = {
+    "network captured": (1e-5, 870, 7200),
+    "solver captured": (1e-6, 500, 3500),
+    "refined": (1e-6, 1880, 0),
+    "outfit": (1e-6, 1580, 0),
+}
+SLOW = {
+    "network": (1e-5, 1500, 0),
+    "network fixed": (1e-5, 1000, 0),
+    "paper's features": (1e-5, 2780, 0),
+    "solver": (1e-6, 1700, 0),
+    "fasteners": (1e-6, 1670, 0),
+}
+#: Of the weights, after four updates with signed steps of 1e-3.
+LEARNED = 1e-3
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Any:
+    """What came of a way, by its name."""
+    try:
+        find_compiler()
+    except BuildError as error:
+        pytest.skip(str(error))
+    folder = tmp_path_factory.mktemp("device")
+    assert pytestconfig.cache is not None
+    kept = pytestconfig.cache.mkdir("standin")  # compiled once for all runs of the tests
+
+    @functools.cache
+    def run(name: str) -> dict[str, Any]:
+        return ask(folder, kept, name)
+
+    return run
+
+
+def ask(folder: Path, kept: Path, name: str) -> dict[str, Any]:
+    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+    here = os.environ | {"PYTHONPATH": path, "STANDIN_BUILD": str(kept), "HOOD_TRACEBACK": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-P", str(HERE / "ways.py"), str(folder), name], env=here, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    assert "error" not in found, f"{found['text']}\n{found['error']}"
+    return found
+
+
+@pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_a_rollout_is_the_one_of_the_cpu(ran: Any, name: str) -> None:
+    apart, waits, recorded = (FAST | SLOW)[name]
+    found = ran(name)
+    assert set(found["codes"].values()) == {0}, found["text"]
+    assert found["apart"] < apart
+    assert sum(found["waits"].values()) <= waits, found["waits"]
+    assert sum(found["recorded"]) <= recorded
+    assert bool(found["recorded"]) == ("captured" in name)
+
+
+def test_a_training_learns_the_same_and_resumes_to_the_last_bit(ran: Any) -> None:
+    found = ran("training")
+    assert set(found["codes"].values()) == {0}, found["text"]
+    assert found["same"]
+    assert found["apart"] < LEARNED
+
+
+@pytest.mark.slow
+def test_an_evaluation_has_its_table(ran: Any) -> None:
+    found = ran("evaluation")
+    assert set(found["codes"].values()) == {0}, found["text"]
+    assert found["rows"][0] == found["rows"][1] > 0
+
+
+def test_the_device_refuses_what_a_gpu_refuses(ran: Any) -> None:
+    """Otherwise the tests above would show nothing."""
+    assert ran("the device alone")["refused"] == {
+        "arrays of two devices": True,
+        "a generator of the CPU": True,
+        "a value read while a graph is recorded": True,
+        "a copy to the host while a graph is recorded": True,
+        "fresh memory holds numbers": False,
+        "a replay computes anew": True,
+    }

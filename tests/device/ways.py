@@ -1,0 +1,162 @@
+"""Runs commands of hood on the stand-in device and on the CPU, and says what came of it: ``python ways.py FOLDER NAME …``.
+
+One process for all of them: importing torch and hood takes as long as a rollout of three frames. Prints a line of JSON a way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import standin
+import torch
+from safetensors.torch import load_file
+
+SHORT = ("num_frames=4", "video=none", "sheet=false")
+NETWORK = ("checkpoint=quickstart", "refine=0", "kernels=torch")
+SOLVER = ("stepper=newton",)
+PLAIN = ("metrics=none", "guard=off")
+
+#: The command of each way.
+ROLLOUTS: dict[str, tuple[str, ...]] = {
+    "network": ("garment=tshirt", *NETWORK),
+    "network fixed": ("garment=tshirt", *NETWORK, *PLAIN, "step=fixed"),
+    "network captured": ("garment=tshirt", *NETWORK, *PLAIN, "step=captured"),
+    "paper's features": ("garment=tshirt", "checkpoint=ours", "refine=0", "settle=paper"),
+    "solver": ("garment=tshirt", *SOLVER),
+    "solver captured": ("garment=tshirt", *SOLVER, *PLAIN, "step=captured"),
+    "refined": ("garment=tshirt", "checkpoint=quickstart", "refine=2"),
+    "outfit": ("garment=[tank,skirt]", "sequence=plie", *SOLVER, "num_frames=3"),
+    "fasteners": ("garment=jacket", *SOLVER, "events=[{frame: 1, open: front_zip}]", "num_frames=3"),
+}
+TRAINING = (
+    "experiment=quickstart",
+    "model=small",
+    "trainer.statistics_iterations=1",
+    "trainer.workers=0",
+    "data.garments=[tshirt]",
+)
+
+
+def main(folder: Path, names: list[str]) -> None:
+    for name in names:
+        text = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+                found = run(name, folder / name.replace(" ", "_"))
+        except BaseException:  # what a command may raise is what is looked for
+            found = {"error": traceback.format_exc()}
+        print(json.dumps({"way": name, "text": text.getvalue()[-3000:]} | found), flush=True)
+
+
+def run(name: str, folder: Path) -> dict[str, object]:
+    if name in OTHERS:
+        return OTHERS[name](folder)
+    words = (*SHORT, *ROLLOUTS[name])
+    with one_start():
+        codes = {device: command("rollout", *words, device, folder) for device in ("cpu", "standin")}
+    waits = {key: number for key, number in torch.standin.counts().items() if key.startswith("sync")}
+    return {"codes": codes, "apart": apart(folder), "waits": waits, "recorded": list(standin.recorded)}
+
+
+@contextlib.contextmanager
+def one_start() -> Iterator[None]:
+    """The cloth is settled once, for both devices: where it comes to rest depends on the last bit."""
+    from hood.rollouts import loop
+
+    settle, found = loop.find_equilibrium, []
+
+    def again(scene: Any, potential: Any, state: Any, *arguments: Any, **options: Any) -> Any:
+        if not found:
+            found.append(settle(scene, potential, state, *arguments, **options))
+        return replace(found[0], pos=found[0].pos.to(state.pos))
+
+    loop.find_equilibrium = again
+    try:
+        yield
+    finally:
+        loop.find_equilibrium = settle
+
+
+def command(name: str, *words: str | Path) -> int:
+    """The exit code of a command; the last two words are a device and a folder. A CPU has no graphs: steps are fixed there."""
+    from hood.cli.main import main as hood
+
+    *given, device, folder = map(str, words)
+    given = [word.replace("step=captured", "step=fixed") if device == "cpu" else word for word in given]
+    torch.standin.forget()
+    standin.recorded.clear()
+    return hood([name, *given, f"device={device}", f"output={folder}/{device}"])
+
+
+def apart(folder: Path) -> float:
+    """Greatest distance [m] of vertices of the two rollouts; infinite where one is not finite."""
+    from hood.rollouts.file.reader import read_rollout
+
+    first, second = (read_rollout(folder / device / "rollout.h5").cloth_pos for device in ("cpu", "standin"))
+    most = float(abs(first - second).max())
+    return most if most == most else float("inf")
+
+
+def train(folder: Path) -> dict[str, object]:
+    """Four updates on the CPU and on the device, and there the last two again, resumed."""
+    words = (*TRAINING, "trainer.iterations=4", "trainer.keep_at=[2]")
+    codes = {device: command("train", *words, device, folder) for device in ("cpu", "standin")}
+    shutil.copytree(folder / "standin", folder / "half" / "standin")
+    shutil.copy(next((folder / "standin" / "kept").glob("*.pt")), folder / "half" / "standin" / "checkpoint.pt")
+    codes["resumed"] = command("train", *words, "resume=true", "standin", folder / "half")
+    cpu, whole, halves = (load_file(folder / one / "model.safetensors") for one in ("cpu", "standin", "half/standin"))
+    same = all(torch.equal(whole[key], halves[key]) for key in whole)
+    return {
+        "codes": codes,
+        "same": same,
+        "apart": max(float((whole[key].double() - cpu[key].double()).abs().max()) for key in whole),
+    }
+
+
+def evaluate(folder: Path) -> dict[str, object]:
+    words = ("models=[quickstart,newton]", "garments=[tshirt]", "num_frames=4", "gap_states=1", "gap_iterations=5")
+    codes = {device: command("evaluate", *words, device, folder) for device in ("cpu", "standin")}
+    rows = [json.loads((folder / device / "table.json").read_text()) for device in ("cpu", "standin")]
+    return {"codes": codes, "rows": [len(one) for one in rows]}
+
+
+def alone(_: Path) -> dict[str, object]:
+    """What the device makes of calls that a GPU would refuse, without hood."""
+    here = torch.ones(4, device="standin")
+    graph = torch.standin.CUDAGraph()
+    refused = {
+        "arrays of two devices": raises(lambda: here + torch.ones(4)),
+        "a generator of the CPU": raises(lambda: torch.empty(4, device="standin").normal_(generator=torch.Generator())),
+    }
+    with torch.standin.graph(graph):
+        refused["a value read while a graph is recorded"] = raises(lambda: float(here.sum()))
+        refused["a copy to the host while a graph is recorded"] = raises(here.cpu)
+        twice = here * 2
+    refused["fresh memory holds numbers"] = bool(torch.empty(4, device="standin").isfinite().any())
+    here.fill_(3)
+    graph.replay()
+    refused["a replay computes anew"] = twice.tolist() == [6.0] * 4
+    return {"refused": refused}
+
+
+def raises(function: Callable[[], object]) -> bool:
+    try:
+        function()
+    except RuntimeError:
+        return True
+    return False
+
+
+OTHERS = {"training": train, "evaluation": evaluate, "the device alone": alone}
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])
