@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import Cloth, build_cloth
-from hood.cloth.state import Attachments, Obstacle, State, StepInput
+from hood.cloth.state import Attachments, State, StepInput
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
 from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
@@ -118,27 +118,19 @@ class Scene:
             TangledError: triangles of two garments still pass through each other.
         """
         obstacle = self.motion.obstacle(frame, state.origin[0].numpy(), static=True)
-        outfit, cloth, pos, found = self.outfit, self.cloth, state.pos, None
-        device = pos.device
+        outfit, cloth, pos, found, device = self.outfit, self.cloth, state.pos, None, state.pos.device
         if device.type != "cpu":  # the searches for what passes through what are on the host
-            cloth, pos = to_device(cloth, "cpu"), pos.cpu()
-            obstacle = None if obstacle is None else to_device(obstacle, "cpu")
-            outfit = None if outfit is None else outfit._replace(cloth=cloth)
-        given = pos
+            cloth, pos, obstacle = to_device(cloth, "cpu"), pos.cpu(), obstacle and to_device(obstacle, "cpu")
+            outfit = outfit and outfit._replace(cloth=cloth)
         if outfit is None:
             pos = smooth_out(cloth, self.garment.faces, pos, obstacle, self.clearance)
         else:
-            pos = self._each_smoothed(outfit, pos, obstacle)
+            garment = outfit.piece[outfit.faces[:, 0]]
+            for number in range(len(outfit.names)):  # each by itself: where one passes through another nothing is smoothed
+                pos = smooth_out(cloth, outfit.faces[garment == number], pos, obstacle, self.clearance)
             found = separate(outfit, pos, obstacle, self.clearance, self.layers)
             pos = found.pos
-        return (state if pos is given else State(pos.to(device), state.vel, state.origin)), found
-
-    def _each_smoothed(self, outfit: Outfit, pos: Tensor, obstacle: Obstacle | None) -> Tensor:
-        """Garment by garment: where one passes through another nothing is smoothed."""
-        garment = outfit.piece[outfit.faces[:, 0]]
-        for number in range(len(outfit.names)):
-            pos = smooth_out(outfit.cloth, outfit.faces[garment == number], pos, obstacle, self.clearance)
-        return pos
+        return (state if pos is state.pos else State(pos.to(device), state.vel, state.origin)), found
 
     def _require_worn(self, frame: int, skinned: Tensor, settled: Tensor) -> None:
         """Settling shortens the edges of a garment that is worn, and lengthens those of one that a limb passes through."""
