@@ -46,6 +46,7 @@ STRAIN_START = Limit(0.04, "share of the length", "hood.scene.start", "more woul
 
 #: How far the 99th percentile of the vertices still had to go to the minimum of a step, over the time step: 25 mm at 30 fps.
 DISTANCE_UNSOUND = Limit(0.75, "m/s", _CAUSES, "of 374 rollouts the right ones, but for one, reach 0.68")
+DISTANCE_OFTEN = Limit(0.25, "share of frames", _CAUSES, "fewer such steps are mended by the next ones")
 DISTANCE_FAR = Limit(1.5, "m/s", _CAUSES, "one step beyond it is seen")
 #: Where no distance was measured: the unbalanced force over the weight.
 GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a coarse stand-in, wrong both ways by a factor of ten")

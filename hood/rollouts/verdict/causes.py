@@ -18,6 +18,7 @@ from hood.limits import (
     CROSSINGS_SEEN,
     CROSSINGS_UNSOUND,
     DISTANCE_FAR,
+    DISTANCE_OFTEN,
     DISTANCE_UNSOUND,
     GRADIENT_UNSOUND,
     STRAIN_UNSOUND,
@@ -59,8 +60,6 @@ def guard_doubts(data: RolloutData) -> FoundFrames:
 
 #: The metric of :mod:`hood.rollouts.verdict.distance`.
 DISTANCE = "distance_p99"
-#: Steps beyond the limit are mended by the next ones: they count where more than one, and this share of the frames, is.
-_OFTEN = 0.25
 
 
 def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> FoundFrames:
@@ -71,7 +70,7 @@ def solved_causes(metrics: Mapping[str, np.ndarray], dt: float) -> FoundFrames:
     if distance is not None and np.isfinite(distance).any():
         limit, measured, way = DISTANCE_UNSOUND.value * dt, np.isfinite(distance), np.nan_to_num(distance)
         over, known = way > limit, standing_for(measured, measured)
-        often = over.sum() > 1 and standing_for(over, measured).sum() > _OFTEN * known.sum()
+        often = over.sum() > 1 and standing_for(over, measured).sum() > DISTANCE_OFTEN.value * known.sum()
         bad = way > (limit if often else DISTANCE_FAR.value * dt)
         text = f"steps ended more than {1e3 * limit:.2g} mm from their minimum (p99 over the vertices)"
         return FoundFrames([Cause("distance", text, bad, distance, limit, "m", ".0f", 1e3, " mm", measured)])
