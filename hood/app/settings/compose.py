@@ -178,12 +178,13 @@ def plain(node: Any) -> Any:
 
 
 def notes(name: str) -> dict[str, str]:
-    """The comments behind the keys of ``configs/<name>.yaml``: what ``--help`` says of each, ``a.b`` for a key in another."""
+    """The comments behind the keys of ``configs/<name>.yaml`` and of files it takes in (``@_here_``); ``a.b``: b within a."""
     found: dict[str, str] = {}
     path: list[str] = []
     for line in (CONFIG_FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
-        match = re.match(r"( *)(- )?(\w+):[^#]*(?:#\s*(.*))?$", line)
-        if match:
+        if taken := re.match(r"  - (\S+)@_here_$", line):
+            found |= notes(f"{name.rpartition('/')[0]}/{taken.group(1)}")
+        if match := re.match(r"( *)(- )?(\w+):[^#]*(?:#\s*(.*))?$", line):
             group = match.group(2) is not None  # an entry of the list of groups
             path = [] if group else [*path[: len(match.group(1)) // 2], match.group(3)]
             found[match.group(3) if group else ".".join(path)] = match.group(4) or ""
