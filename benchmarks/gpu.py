@@ -174,8 +174,9 @@ class Bench:
         made = []
         for frame, problem in zip(self.frames, self.problems, strict=True):
             device = self.there.cloth.rest_pos.device
-            state = State(*(value.to(device) for value in (problem.state.pos, problem.state.vel, problem.state.origin)))
-            made.append(StepProblem(self.there.cloth, state, self.there.step_input(frame, state)))
+            state = State(problem.state.pos.to(device), problem.state.vel.to(device), problem.state.origin)
+            step = self.there.step_input(frame, state)
+            made.append(StepProblem(self.there.cloth, state, step, gravity=problem.gravity.to(device)))
         return made
 
 
@@ -309,7 +310,7 @@ def network_rows(table: Table, bench: Bench, model: str, precision: str, device:
     simulator.network.use_precision("fp32" if not on_gpu and precision == "tf32" else precision)
     work, problems = bench.work_of(model, simulator, precision), bench.on_device()
     if on_gpu:
-        simulator = simulator.cuda()
+        simulator = simulator.to("cuda")
     prepared: Prepared = simulator.prepare(bench.there.cloth, bench.scene.garment.rest_pos)
     ways = [way for way in WAYS if way != "fused" or (on_gpu and find_spec("triton") is not None)]
     steppers: dict[str, Stepper] = {

@@ -81,7 +81,7 @@ class WorkCounter(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
         name = func._opname.rstrip("_") if hasattr(func, "_opname") else ""
-        if name and func._opname not in VIEWS and name not in _ALLOCATIONS:
+        if name and func.namespace == "aten" and func._opname not in VIEWS and name not in _ALLOCATIONS:
             given = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
             made = [value for value in tree_leaves(result) if isinstance(value, Tensor)]
             self.work.kernels.append(_kernel(name, given, made))

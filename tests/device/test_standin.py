@@ -93,6 +93,11 @@ def test_an_evaluation_has_its_table(ran: Any) -> None:
     assert found["rows"][0] == found["rows"][1] > 0
 
 
+@pytest.mark.slow
+def test_the_benchmark_for_a_gpu_goes_through_its_jobs(ran: Any) -> None:
+    assert {"ours plain", "ours captured", "newton 5 plain", "newton 5 captured"} <= set(ran("benchmark")["ways"])
+
+
 def test_the_device_refuses_what_a_gpu_refuses(ran: Any) -> None:
     """Otherwise the tests above would show nothing."""
     assert ran("the device alone")["refused"] == {

@@ -6,11 +6,14 @@ One process for all of them: importing torch and hood takes as long as a rollout
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 import json
+import os
 import shutil
 import sys
 import traceback
+import types
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -129,6 +132,23 @@ def evaluate(folder: Path) -> dict[str, object]:
     return {"codes": codes, "rows": [len(one) for one in rows]}
 
 
+def benchmark(folder: Path) -> dict[str, object]:
+    """Every job of ``benchmarks/gpu.py`` on one small garment. Times mean nothing; constants are those of a data sheet."""
+    place = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
+    module = types.ModuleType("gpu_on_standin")
+    module.__file__ = str(place)
+    sys.modules[module.__name__] = module
+    sys.path.insert(0, str(place.parent))
+    exec(compile(standin.otherwise(place.read_text(encoding="utf-8")), module.__file__, "exec"), vars(module))
+    vars(module).update(measured_device=lambda: module.DATA_SHEETS["h100"], count_launches=lambda call: (call(), 0)[1])
+    os.environ.update({key: os.environ.get(key, value) for key, value in module.ENVIRONMENT.items()})  # or it starts anew
+    folder.mkdir()
+    sys.argv = ["gpu.py", "--sizes", "1000", "--models", "ours", "--minutes", "8", "--csv", str(folder / "gpu.csv")]
+    module.main()
+    rows = list(csv.DictReader((folder / "gpu.csv").read_text().splitlines()))
+    return {"ways": sorted({f"{row['method']} {row['way']}" for row in rows})}
+
+
 def alone(_: Path) -> dict[str, object]:
     """What the device makes of calls that a GPU would refuse, without hood."""
     here = torch.ones(4, device="standin")
@@ -156,7 +176,7 @@ def raises(function: Callable[[], object]) -> bool:
     return False
 
 
-OTHERS = {"training": train, "evaluation": evaluate, "the device alone": alone}
+OTHERS = {"training": train, "evaluation": evaluate, "benchmark": benchmark, "the device alone": alone}
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]), sys.argv[2:])

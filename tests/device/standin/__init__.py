@@ -135,12 +135,16 @@ _OTHERWISE = (
 )
 
 
+def otherwise(text: str) -> str:
+    """A module's text for the stand-in."""
+    for pattern, replacement in _OTHERWISE:
+        text = pattern.sub(replacement, text)
+    return text
+
+
 class _Loader(importlib.machinery.SourceFileLoader):
     def source_to_code(self, data, path, *, _optimize=-1):  # type: ignore[no-untyped-def,override]
-        text = data.decode("utf-8")
-        for pattern, replacement in _OTHERWISE:
-            text = pattern.sub(replacement, text)
-        return super().source_to_code(text.encode("utf-8"), path, _optimize=_optimize)
+        return super().source_to_code(otherwise(data.decode("utf-8")).encode("utf-8"), path, _optimize=_optimize)
 
     def get_code(self, fullname):  # type: ignore[no-untyped-def]
         path = self.get_filename(fullname)
