@@ -41,14 +41,14 @@ class GivenUpError(Exception):
     """A process that torchrun started ends, and has said why."""
 
 
-def together(command: Callable[[], Result], patience: timedelta = distributed.UNEQUAL) -> Result:
+def together(command: Callable[[], Result], timeout: timedelta = distributed.BATCH_TIMEOUT) -> Result:
     """Run a command that torchrun may have started several times; an error of process 0 that ends all is told once. No process
-    waits longer than ``patience`` for another.
+    waits longer than ``timeout`` for another.
 
     Raises:
         GivenUpError: instead of another process's ValueError, OSError or ImportError.
     """
-    distributed.start(patience)
+    distributed.start(timeout)
     try:
         return command()
     except (ValueError, OSError, ImportError) as error:
@@ -253,7 +253,7 @@ def require_device(config: Settings) -> None:
         return
     if not torch.cuda.is_available():
         raise ConfigError("device=cuda: no CUDA device is available; use device=cpu")
-    gpus, processes = torch.cuda.device_count(), distributed.processes_here()
+    gpus, processes = torch.cuda.device_count(), distributed.local_world_size()
     if processes > gpus:
         raise ConfigError(f"device=cuda: {processes} processes and {gpus} GPU{'s' * (gpus > 1)} here; --nproc-per-node {gpus}")
-    torch.cuda.set_device(distributed.rank_here())
+    torch.cuda.set_device(distributed.local_rank())

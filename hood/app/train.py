@@ -117,7 +117,7 @@ def _train(overrides: Sequence[str], bar: TrainingBar, notes: list[str]) -> Trai
     if distributed.is_first():
         for sentence in idle_in_training(overrides, config):
             say(sentence)
-    return together(lambda: _in_folder(config, bar, notes), distributed.EQUAL)
+    return together(lambda: _in_folder(config, bar, notes), distributed.TRAINING_TIMEOUT)
 
 
 def _check_values(config: DictConfig) -> None:

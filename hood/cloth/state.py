@@ -56,9 +56,8 @@ class StepInput:
     time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
 
     def __post_init__(self) -> None:
-        if self.dt.device.type != "cpu":  # checked where it was made: reading it back would make the host wait
-            return
-        sound = [0.0 < dt < float("inf") for dt in self.dt.reshape(-1).tolist()]
+        on_host = self.dt.device.type == "cpu"  # values elsewhere are not read back: the host would wait in every step
+        sound = [0.0 < dt < float("inf") for dt in self.dt.reshape(-1).tolist()] if on_host else []
         if self.dt.ndim != 1 or not all(sound):
             scene = sound.index(False) if False in sound else 0
             raise ValueError(

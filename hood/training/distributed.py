@@ -15,20 +15,19 @@ from torch.nn.parallel import DistributedDataParallel
 
 Result = TypeVar("Result")
 
-#: Shares of a batch of rollouts may differ by hours: the one that is done first waits.
-UNEQUAL = timedelta(days=7)
-#: Updates of a training take as long on every process: who waits so long for another one waits for nothing.
-EQUAL = timedelta(hours=1)
+#: How long a process waits for the others. Shares of a batch of rollouts may differ by hours; updates of a training take as long
+#: on every process.
+BATCH_TIMEOUT, TRAINING_TIMEOUT = timedelta(days=7), timedelta(hours=1)
 _TOLD = "raised on process 0"
 
 
-def start(patience: timedelta = UNEQUAL) -> None:
+def start(timeout: timedelta = BATCH_TIMEOUT) -> None:
     """Join the process group when torchrun started this process; otherwise do nothing. A process that waits longer than
-    ``patience`` for the others ends with an error."""
+    ``timeout`` for the others ends with an error."""
     if "WORLD_SIZE" in os.environ and int(os.environ["WORLD_SIZE"]) > 1 and not dist.is_initialized():
         # Flags and slots are exchanged on the CPU in any case, gradients where the model is.
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-        dist.init_process_group(backend, timeout=patience)
+        dist.init_process_group(backend, timeout=timeout)
 
 
 def stop() -> None:
@@ -47,12 +46,12 @@ def is_first() -> bool:
     return int(os.environ.get("RANK", "0")) == 0 if not dist.is_initialized() else rank() == 0
 
 
-def processes_here() -> int:
+def local_world_size() -> int:
     """Number of processes on this machine, 1 when alone; also before they have joined."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
-def rank_here() -> int:
+def local_rank() -> int:
     """Number of this process on this machine, 0 when alone; also before it has joined the others."""
     return int(os.environ.get("LOCAL_RANK", "0"))
 

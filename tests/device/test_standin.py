@@ -42,7 +42,7 @@ LEARNED = 1e-3
 def ran(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Any:
     """What came of a way, by its name."""
     try:
-        find_compiler()
+        compiler = find_compiler()
     except BuildError as error:
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("device")
@@ -51,14 +51,14 @@ def ran(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -
 
     @functools.cache
     def run(name: str) -> dict[str, Any]:
-        return ask(folder, kept, name)
+        return ask(folder, {"STANDIN_BUILD": str(kept), "CXX": compiler}, name)
 
     return run
 
 
-def ask(folder: Path, kept: Path, name: str) -> dict[str, Any]:
+def ask(folder: Path, built: dict[str, str], name: str) -> dict[str, Any]:
     path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
-    here = os.environ | {"PYTHONPATH": path, "STANDIN_BUILD": str(kept), "HOOD_TRACEBACK": "1", "OMP_NUM_THREADS": "1"}
+    here = os.environ | built | {"PYTHONPATH": path, "HOOD_TRACEBACK": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-P", str(HERE / "ways.py"), str(folder), name], env=here, capture_output=True, text=True, check=False
     )

@@ -23,7 +23,7 @@ from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper
 from hood.studies.envelope.judge import CLASSES, SILENT, SOUND
 
-#: Cells in which no method holds, and which take as long as six others.
+#: Cells that wait for ``-m slow``, which keeps the fast tests short.
 SLOW = (
     "stretching-x0.01",
     "density-5-kg-m",
