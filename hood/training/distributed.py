@@ -15,8 +15,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 Result = TypeVar("Result")
 
-#: How long a process waits for the others. Shares of a batch of rollouts may differ by hours; updates of a training take as long
-#: on every process.
+#: How long a process waits for the others. Shares of a batch of rollouts may differ by hours; updates of a training take
+#: as long on every process.
 BATCH_TIMEOUT, TRAINING_TIMEOUT = timedelta(days=7), timedelta(hours=1)
 _TOLD = "raised on process 0"
 
