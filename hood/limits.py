@@ -49,7 +49,7 @@ DISTANCE_UNSOUND = Limit(0.75, "m/s", _CAUSES, "of 374 rollouts the right ones, 
 DISTANCE_OFTEN = Limit(0.25, "share of frames", _CAUSES, "fewer such steps are mended by the next ones")
 DISTANCE_FAR = Limit(1.5, "m/s", _CAUSES, "one step beyond it is seen")
 #: Where no distance was measured: the unbalanced force over the weight.
-GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a coarse stand-in, wrong both ways by a factor of ten")
+GRADIENT_UNSOUND = Limit(100.0, "times the weight", _CAUSES, "a rough estimate, up to ten times too high or too low")
 
 #: Skin through cloth, apart from folds of the skin.
 CUT_UNSOUND = Limit(0.01, "share of the cloth's triangles", _SKIN, "pictures show ten of a thousand triangles")
@@ -62,7 +62,7 @@ SPOTS_HEIGHT = Limit(0.0015, "m", _SKIN, "lower spots flicker")
 SPOTS_LASTING = Limit(0.35, "share of frames", _SKIN, "spots that come and go are not seen")
 #: Larger spots count where they last less long.
 SPOTS_LARGE = Limit(
-    0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: good ones have them in one frame looked at, at most"
+    0.004, "share of the cloth's triangles", _SKIN, "498 rollouts: right ones have them in at most one measured frame"
 )
 SPOTS_LARGE_LASTING = Limit(0.20, "share of frames", _SKIN, "right rollouts have them in 0.14")
 #: Cloth that is under the skin as a whole cuts nothing.
@@ -77,7 +77,7 @@ AWAY_UNSOUND = Limit(0.20, "m", _WORN, "43 rollouts: worn at most 0.11, come off
 SLIPPED_UNSOUND = Limit(0.15, "m", _WORN, "498 rollouts: worn at most 0.14, come off at least 0.15")
 SUNK_UNSOUND = Limit(0.06, "m", _WORN, "498 rollouts: worn at most 0.04, come off at least 0.07")
 SHIFTED_UNSOUND = Limit(0.20, "m", _WORN, "374 rollouts: worn at most 0.16, wound round the trunk 0.24")
-SUNK_SETTLING = Limit(0.12, "m", _WORN, "worn at most 0.11, but for a band; come off at least 0.14")
+SUNK_SETTLING = Limit(0.12, "m", _WORN, "worn at most 0.11 (one band excepted); come off at least 0.14")
 
 #: The body.
 HEAD_DOWN = Limit(0.5, "share of frames", _DOUBTS, "cartwheels are shorter, and handstands stand on the hands")

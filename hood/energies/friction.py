@@ -53,9 +53,8 @@ class LaggedFriction(Energy):
     """Friction energy [J], the sum over vertices of μ_f φ N f(‖u_T‖); subclasses say what the normal force N is.
 
     u_T is the tangential slip from t to t+1 relative to the matched body point, N is taken at t (lagged, so that
-    the friction is a potential). f is the C¹ mollifier of Li et al. ("Incremental Potential Contact", 2020, eq.
-    12 and 13) with e = ``slip_speed`` · dt: quadratic-cubic below a slip of e, equal to ‖u_T‖ above. The force
-    is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
+    the friction is a potential). f is :func:`hood.energies.laws.mollified_norm` with e = ``slip_speed`` · dt, equal
+    to ‖u_T‖ above. The force is at most μ_f φ N and reaches it at ``slip_speed``; below, contacts creep.
 
     φ → ``cloth.friction`` (V,), what the fabric makes of the coefficient, times ``obstacle.friction_scale`` (G,) of the body's
     face.

@@ -72,7 +72,7 @@ def contact_balance(weight: float | Tensor, depth: Tensor, compliance: Tensor) -
 
 
 def mollified_norm(norm_sq: Tensor, limit: Tensor) -> Tensor:
-    """f(y) [m] for slips y² = ``norm_sq`` (N,): y²/e - y³/(3e²) + e/3 below e = ``limit`` (N,) [m], y above; C¹, flat at 0.
+    """f(y) [m] for slips y² = ``norm_sq`` (N,): y²/e - y³/(3e²) + e/3 below e = ``limit`` (N,) [m], y above; C², flat at 0.
 
     The mollifier of Li et al., "Incremental Potential Contact" (2020), equations 12 and 13.
     """

@@ -404,6 +404,7 @@ class Trainer:
         with timed(self.stopwatch, "backward"):
             surrogate.backward()
         with timed(self.stopwatch, "optimiser"):
+            # The norm before it is shortened, which also tells infinite gradients.
             norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
             if distributed.any_rank(not (finite and math.isfinite(norm))):
                 self._skips.skip(self.iteration + 1, energies, norm)

@@ -8,7 +8,7 @@ A rollout is unsound
   bad where the cloth is torn, its step ended too far from the minimum, or skin or cloth come through the cloth.
   What is measured in every n-th frame stands for those up to the next; of five frames or fewer all after the start must be bad.
   Cloth that is torn to twice its length is judged in every frame, single ones as well. Of a limb that has gone through it, and
-  of skin through a fiftieth of it, one frame is enough.
+  of skin through a fiftieth of it, one frame is enough, however long the rollout is.
 
 The numbers are those of :mod:`hood.limits`.
 """
@@ -78,8 +78,9 @@ def judge_rollout(data: RolloutData) -> Verdict:
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
     among = "frames" if few or judged[: int(SETTLING.value)].any() else "frames after the fifth"
-    gross = torn.any() or any(_is_gross(cause, judged) for cause in found.causes)
-    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if gross else 1)
+    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if torn.any() else 1)
+    if not few and any(_is_gross(cause, judged) for cause in found.causes):
+        tolerated = 0
     if bad.sum() > tolerated:
         reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
     doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))

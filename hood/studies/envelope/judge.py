@@ -104,7 +104,7 @@ def judge(
     if not finite.all():
         reason = f"not finite from frame {int(np.argmin(finite))} on"
         return Judged(FAILED if told else SILENT, (reason,), told)
-    reasons = (*run.unsound, *_shortcomings(cell, run.metrics, solver, network, criteria))
+    reasons = run.unsound or tuple(_shortcomings(cell, run.metrics, solver, network, criteria))
     if cell.bad_input:
         reasons = (*reasons, "bad input was taken")
     if not reasons:

@@ -52,7 +52,8 @@ class Task:
 
 
 def make_tasks(config: DictConfig) -> list[Task]:
-    """All rollouts of the map, those that others are held against first.
+    """All rollouts of the map, of each cell those that others are held against first. The finer ones of the solver need not all
+    be made.
 
     Raises:
         ConfigError: no such factor, or no model or garment.

@@ -43,11 +43,12 @@ SLEEVE, SLEEVE_FACES = tube(0.105, 0.3, 0.7, 96, 40)
 
 def worn(dents: np.ndarray, size: int) -> RolloutData:
     """A sleeve around a post whose middle is pushed ``dents`` (T,) metres into it, over ``size`` by ``size`` vertices."""
-    cloth = np.repeat(SLEEVE[None], COUNT, axis=0)
+    count = len(dents)
+    cloth = np.repeat(SLEEVE[None], count, axis=0)
     pushed = (20 + np.arange(size))[:, None] * 96 + 10 + np.arange(size)
     outwards = SLEEVE[pushed.ravel()] * [1.0, 0.0, 1.0]
     cloth[:, pushed.ravel()] -= dents[:, None, None] * outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
-    return stored(COUNT, {"strain_p99": frames(COUNT)}, cloth=cloth, faces=SLEEVE_FACES, body=POST,
+    return stored(count, {"strain_p99": frames(count)}, cloth=cloth, faces=SLEEVE_FACES, body=POST,
                   body_faces=POST_FACES.astype(np.int32))  # fmt: skip
 
 
@@ -82,6 +83,16 @@ def test_one_frame_of_much_skin_counts_between_measured_ones(size: int, sound: b
     if not sound:
         (reason,) = verdict.reasons
         assert (reason.kind, reason.frame) == ("skin_through_cloth", 9)
+
+
+@pytest.mark.parametrize(("dent", "sound"), [(0.025, True), (0.045, False)])
+def test_a_limb_through_the_cloth_is_seen_in_one_frame_of_a_long_rollout(dent: float, sound: bool) -> None:
+    """20 mm and 40 mm, in one frame of sixty, all of which were measured."""
+    once = np.arange(60) == 40
+    data, short = worn(np.where(once, dent, 0.0), 9), worn(np.array([0.0, dent]), 9)
+    for name, values in surface_metrics(short, meshes_of(short)).items():
+        data.step_metrics[name] = np.where(once, values[1], values[0])
+    assert judge_rollout(data).sound is sound
 
 
 def test_skin_that_sticks_out_far_counts_by_its_height() -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hood.app.settings.compose import ConfigError, load_config
 from hood.cli.main import main
+from hood.rollouts.verdict.rule import Verdict
 from hood.studies.envelope import envelope
 from hood.studies.envelope import tasks as envelope_tasks
 from hood.studies.envelope.cells import NOMINAL, Cell, cells
@@ -130,6 +134,26 @@ def test_a_cell_is_run_once_and_told(
     record.write_text(json.dumps(json.loads(record.read_text()) | {"weights": "others"}))
     with pytest.raises(AssertionError, match="run again"):
         main(words)
+
+
+@pytest.mark.parametrize(("strain", "sound", "asked"), [(0.2, True, False), (0.3, True, True), (0.3, False, False)])
+def test_a_finer_rollout_of_the_solver_is_made_where_it_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strain: float, sound: bool, asked: bool
+) -> None:
+    made: list[str] = []
+
+    def beside(started: Iterable[tuple[Task, object, Path]], *given: object) -> Iterator[tuple[Task, Ended]]:
+        for task, _, folder in started:
+            made.append(task.model)
+            folder.mkdir(parents=True)
+            yield task, Ended(0, "", 1.0)
+
+    monkeypatch.setattr(envelope_tasks, "cells", lambda: (Cell("fall", "2 m"),))
+    monkeypatch.setattr(envelope, "run_beside", beside)
+    monkeypatch.setattr(envelope, "read_rollout", lambda path: SimpleNamespace(metrics={"strain_p99": np.full(9, strain)}))
+    monkeypatch.setattr(envelope, "judge_rollout", lambda data: Verdict(sound))
+    assert main(["envelope", "models=[quickstart]", "garments=[tank]", "factors=[fall]", f"output={tmp_path}"]) == 0
+    assert made == ["newton", "quickstart", *([REFERENCE] if asked else [])]
 
 
 def _never(task: object) -> tuple[Task, Ended]:
