@@ -1,8 +1,8 @@
 """The scalar laws of contact and friction, each with its slope and curvature: what training, solver and refinement compute.
 
-The compiled forms take the same laws from ``hood/native/laws.h``. A friction law f(y) must be flat at 0 and have
-f'' <= f' / y, which the solvers rely on. Orders of operations are part of a law: results of earlier
-versions stay the same to the last bit.
+The compiled forms take the same laws from ``hood/native/laws.h``. A friction law f(y) must be flat at 0, twice
+differentiable, have f'' <= f' / y, and be y from the limit on: the solvers rely on it. Orders of operations are part of a law:
+results of earlier versions stay the same to the last bit.
 """
 
 from __future__ import annotations
