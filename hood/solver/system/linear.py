@@ -17,7 +17,7 @@ from hood.energies.problem import sum_per_scene
 from hood.solver.derivatives.self_contact import LayerRows
 from hood.solver.system.plan import QuadraticModel, SolverPlan
 from hood.solver.system.sparsity import BlockPattern, row_product
-from hood.tensors.dense import is_whole
+from hood.tensors.dense import is_whole, sum_rows
 
 #: Below this share of the indefinite part the next try does without.
 LEAST_SHARPNESS = 0.2
@@ -148,8 +148,8 @@ def product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor
 
 def block_product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor]:
     """The same in torch operations, on any device."""
-    rows, cols = (torch.as_tensor(index, device=triples.device) for index in (pattern.triple_rows, pattern.triple_cols))
-    return lambda x: torch.zeros_like(x).view(-1).index_add(0, rows, (triples * x[cols]).sum(1)).view(-1, 3)
+    cols, starts = (torch.as_tensor(table, device=triples.device) for table in (pattern.indices, pattern.indptr))
+    return lambda x: sum_rows(x.reshape(-1, 1), cols, starts, triples.reshape(-1)).view(-1, 3)
 
 
 def conjugate_gradients(

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from hood.tensors.dense import is_whole
+from hood.tensors.dense import is_whole, sum_rows
 
 
 def row_product(data: Tensor, cols: np.ndarray, starts: np.ndarray, width: int) -> Callable[[Tensor], Tensor]:
@@ -30,7 +30,7 @@ def row_product(data: Tensor, cols: np.ndarray, starts: np.ndarray, width: int) 
 class Scatter:
     """Sums entries of a vector (N,) into another (M,): entry ``source[k]`` is added to entry ``target[k]``.
 
-    A sparse matrix product on the CPU: several times faster there than ``index_add``.
+    A sparse matrix product on the CPU: several times faster there than ``index_add``. Sums have a fixed order on any device.
 
     Args:
         target, source: (K,) each, of any shape with K entries; pairs with a negative target are left out.
@@ -43,9 +43,9 @@ class Scatter:
         kept = np.flatnonzero(target >= 0)
         order = kept[np.argsort(target[kept], kind="stable")]
         self.size, self.num_values = size, num_values
-        self._target, self._source = torch.as_tensor(target[order]), torch.as_tensor(source[order])
         starts = np.concatenate([[0], np.cumsum(np.bincount(target[order], minlength=size))])
         self._structure = (source[order].astype(np.int32), starts.astype(np.int32), num_values)
+        self._source, self._starts = (torch.from_numpy(table) for table in self._structure[:2])
         self._products: dict[torch.dtype, Callable[[Tensor], Tensor]] = {}
 
     def __call__(self, values: Tensor) -> Tensor:
@@ -59,8 +59,8 @@ class Scatter:
 
     def by_index(self, values: Tensor) -> Tensor:
         """The same in torch operations, on any device."""
-        self._target, self._source = self._target.to(values.device), self._source.to(values.device)
-        return values.new_zeros(self.size).index_add(0, self._target, values.reshape(-1)[self._source])
+        self._source, self._starts = self._source.to(values.device), self._starts.to(values.device)
+        return sum_rows(values.reshape(-1, 1), self._source, self._starts).view(-1)
 
 
 def to_vertices(corners: np.ndarray, size: int) -> Scatter:

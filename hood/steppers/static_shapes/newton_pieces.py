@@ -18,6 +18,7 @@ from hood.solver.system.iterate import Iterate, Unknowns, first_iterate, in_doub
 from hood.solver.system.line_search import ARMIJO, BACKTRACKS, Stop, shorter
 from hood.solver.system.linear import FIRST_SHARPNESS, LEAST_SHARPNESS, by_blocks, invert_blocks
 from hood.solver.system.plan import ModelBuilder, QuadraticModel, SolverPlan
+from hood.tensors.dense import sum_rows
 
 #: Conjugate gradient iterations of a piece: between two looks of the host.
 CG_PIECE = 8
@@ -122,9 +123,9 @@ class FixedSystem:
         plan, pos, num_scenes = self._plan, like.state.pos, like.num_scenes
         pattern, device = plan.pattern, pos.device
         self._num_scenes, self._scene = num_scenes, plan.scene
-        self._rows, self._cols = (torch.as_tensor(table, device=device) for table in (pattern.triple_rows, pattern.triple_cols))
+        self._cols, self._starts = (torch.as_tensor(table, device=device) for table in (pattern.indices, pattern.indptr))
         self._diagonal = pattern.diagonal.to(device).reshape(-1)
-        self._triple_scene = plan.scene[self._rows // 3]
+        self._triple_scene = plan.scene[torch.as_tensor(pattern.triple_rows // 3, device=device)]
         self._identity = pos.new_zeros(pattern.num_triples, 3)
         self._identity[self._diagonal] = torch.eye(3, dtype=pos.dtype, device=device).repeat(len(plan.vertices), 1)
         gravity = float(like.gravity.norm()) or STANDARD_GRAVITY
@@ -278,8 +279,7 @@ class FixedSystem:
         return torch.where(active.index_select(0, self._triple_scene).unsqueeze(1), triples, self._identity)
 
     def _apply(self, x: Tensor) -> Tensor:
-        products = (self._triples * x.index_select(0, self._cols)).sum(1)
-        return torch.zeros_like(x).view(-1).index_add(0, self._rows, products).view(-1, 3)
+        return sum_rows(x.reshape(-1, 1), self._cols, self._starts, self._triples.reshape(-1)).view(-1, 3)
 
     def _dot(self, a: Tensor, b: Tensor) -> Tensor:
         return self._sum((a * b).sum(dim=1), self._scene)
