@@ -177,7 +177,7 @@ class FixedSystem:
     @torch.no_grad()
     def _direct(self) -> None:
         """Right-hand side and preconditioner of the scenes that move."""
-        model, moving = self._model, self._active.index_select(0, self._scene).unsqueeze(1)
+        model, moving = self._model, self._spread(self._active)
         self._rhs = torch.where(moving, -model.gradient.index_select(0, self._plan.vertices), 0.0)
         triples = self._idle(model.triples, self._active)
         self._inverse = invert_blocks(triples.index_select(0, self._diagonal).view(-1, 3, 3))
@@ -191,7 +191,7 @@ class FixedSystem:
         """The matrix with its share of the indefinite part, and where conjugate gradients begin."""
         share = self._sharpness.index_select(0, self._triple_scene).unsqueeze(1)
         self._triples = self._idle(torch.addcmul(self._model.triples, self._model.indefinite_part, share), self._pending)
-        rhs = torch.where(self._pending.index_select(0, self._scene).unsqueeze(1), self._rhs, 0.0)
+        rhs = torch.where(self._spread(self._pending), self._rhs, 0.0)
         z = by_blocks(self._inverse)(rhs)
         rz = self._dot(rhs, z)
         for memory, value in ((self._r, rhs), (self._p, z), (self._rz, rz), (self._limit, self._tolerance**2 * rz)):
@@ -209,17 +209,15 @@ class FixedSystem:
             self._taken.add_(1.0)
             q = self._apply(p)
             curvature = self._dot(p, q)
-            indefinite = indefinite | (running & ~(curvature > 0))
-            running = running & (curvature > 0)
-            length = torch.where(running, rz / torch.where(running, curvature, 1.0), 0.0)
-            length = length.index_select(0, self._scene).unsqueeze(1)
-            x, r = torch.where(length > 0, x + length * p, x), torch.where(length > 0, r - length * q, r)
+            curved = running & (curvature > 0)
+            indefinite = indefinite | (running & ~curved)
+            moving, length = self._spread(curved), self._spread(rz / curvature)
+            x = torch.where(moving, torch.addcmul(x, length, p), x)
+            r = torch.where(moving, torch.addcmul(r, length, q, value=-1.0), r)
             z = by_blocks(self._inverse)(r)
-            before, rz = rz, torch.where(running, self._dot(r, z), rz)
-            onwards = torch.where(running, rz / torch.where(running, before, 1.0), 0.0)
-            running = running & (rz > self._limit)
-            going = running.index_select(0, self._scene).unsqueeze(1)
-            p = torch.where(going, z + onwards.index_select(0, self._scene).unsqueeze(1) * p, p)
+            before, rz = rz, torch.where(curved, self._dot(r, z), rz)
+            running = curved & (rz > self._limit)
+            p = torch.where(self._spread(running), torch.addcmul(z, self._spread(rz / before), p), p)
         after = (x, r, p, rz, running, indefinite)
         for memory, value in zip((self._x, self._r, self._p, self._rz, self._running, self._indefinite), after, strict=True):
             memory.copy_(value)
@@ -229,7 +227,7 @@ class FixedSystem:
         """Take solutions over; scenes whose matrix is not positive definite try again with half the share of the
         indefinite part."""
         failed = self._indefinite & self._pending & (self._sharpness > 0)
-        found = (self._pending & ~failed).index_select(0, self._scene).unsqueeze(1)
+        found = self._spread(self._pending & ~failed)
         self._solution.copy_(torch.where(found, self._x, self._solution))
         smaller = torch.where(self._sharpness > LEAST_SHARPNESS, 0.5 * self._sharpness, 0.0)
         self._sharpness.copy_(torch.where(failed, smaller, self._sharpness))
@@ -241,7 +239,7 @@ class FixedSystem:
         """The path of the line search."""
         plan, now = self._plan, self._now
         self._sharpness.copy_(torch.where(self._halved, self._sharpness, (2.0 * self._sharpness).clamp(FIRST_SHARPNESS, 1.0)))
-        moving = self._active.index_select(0, self._scene).unsqueeze(1)
+        moving = self._spread(self._active)
         direction = torch.zeros_like(now.pos).index_copy(0, plan.vertices, torch.where(moving, self._solution, 0.0))
         slope = self._sum((self._model.gradient * direction).sum(dim=1), self._problem.cloth.vertex_scene)
         self._from, self._slope = Iterate(*(value.clone() for value in vars(now).values())), slope
@@ -281,8 +279,12 @@ class FixedSystem:
     def _apply(self, x: Tensor) -> Tensor:
         return sum_rows(x.reshape(-1, 1), self._cols, self._starts, self._triples.reshape(-1)).view(-1, 3)
 
+    def _spread(self, values: Tensor) -> Tensor:
+        """From scenes (B,) to their vertices (N, 1); of one scene it stays one value, (1, 1)."""
+        return values.view(1, 1) if self._num_scenes == 1 else values.index_select(0, self._scene).unsqueeze(1)
+
     def _dot(self, a: Tensor, b: Tensor) -> Tensor:
-        return self._sum((a * b).sum(dim=1), self._scene)
+        return (a * b).sum().reshape(1) if self._num_scenes == 1 else self._sum((a * b).sum(dim=1), self._scene)
 
     def _sum(self, values: Tensor, scene: Tensor) -> Tensor:
         return values.sum().reshape(1) if self._num_scenes == 1 else sum_per_scene(values, scene, self._num_scenes)

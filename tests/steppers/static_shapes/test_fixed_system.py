@@ -118,5 +118,5 @@ def test_nothing_in_a_piece_depends_on_data(skirt_scene, potential):
 def _empty_scatter(scatter):
     empty = object.__new__(type(scatter))
     vars(empty).update(vars(scatter))
-    empty._target, empty._source = without_values(scatter._target), without_values(scatter._source)
+    empty._source, empty._starts = without_values(scatter._source), without_values(scatter._starts)
     return empty
