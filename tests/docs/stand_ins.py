@@ -53,7 +53,7 @@ class Desk:
             (r"shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
-            (r"(first|second)\.txt", self.list_of_motions),
+            (r"(first|second|part00)\.txt", self.list_of_motions),
             (r"hero\.glb", self.hero),
             (r"models/SMPLX_NEUTRAL\.npz", self.smplx),
             (r"pieces/.*\.npz", self.piece),
