@@ -73,7 +73,7 @@ CROSSINGS_UNSOUND = Limit(0.4, "m", _CAUSES, "the length of a forearm; shorter o
 CROSSINGS_SEEN = Limit(0.25, "m", _CAUSES, "the length of a hand, of what a viewer can see of them")
 
 #: Worn, see hood.rollouts.verdict.worn.
-AWAY_UNSOUND = Limit(0.18, "m", _WORN, "417 rollouts: worn at most 0.11, come off at least 0.19")
+AWAY_UNSOUND = Limit(0.18, "m", _WORN, "417 rollouts: worn at most 0.11, come off 0.19 and more, or slip")
 SLIPPED_UNSOUND = Limit(0.15, "m", _WORN, "498 rollouts: worn at most 0.14, come off at least 0.15")
 SUNK_UNSOUND = Limit(0.06, "m", _WORN, "498 rollouts: worn at most 0.04, come off at least 0.07")
 SHIFTED_UNSOUND = Limit(0.20, "m", _WORN, "374 rollouts: worn at most 0.16, wound round the trunk 0.24")

@@ -78,9 +78,9 @@ def judge_rollout(data: RolloutData) -> Verdict:
     bad = np.any([cause.spread for cause in found.causes], axis=0) & judged if found.causes else np.zeros_like(judged)
     few = len(finite) <= SETTLING.value
     among = "frames" if few or judged[: int(SETTLING.value)].any() else "frames after the fifth"
-    tolerated = judged.sum() - 1 if few else max(TOLERATED.value * judged.sum(), 0 if torn.any() else 1)
-    if not few and any(_is_gross(cause, judged) for cause in found.causes):
-        tolerated = 0
+    gross = any(_is_gross(cause, judged) for cause in found.causes)
+    share = 0 if gross else max(TOLERATED.value * judged.sum(), 0 if torn.any() else 1)
+    tolerated = judged.sum() - 1 if few else share
     if bad.sum() > tolerated:
         reasons += [_reason(cause, judged, among) for cause in found.causes if (cause.bad & judged).any()]
     doubts = (*stored_doubts(data), *(doubt.as_dict() for doubt in (*off.doubts, *found.doubts)))
