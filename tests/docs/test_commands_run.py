@@ -95,7 +95,6 @@ SLOW = (
     (r"^evaluate .*models=\[(?!runs/(mine|fine15))(?!.*SMPL_)", "rows of other models, as of a run, a network and the solver"),
     (r"^fabric chiffon", "thirteen fabrics, as of two"),
     (r"^train .*weights=[B-E]/|^train model=edges .*weights=", "further stages of recipes, as the first two of one"),
-    (r"^train model=ours trainer=paper", "the model and the settings of experiment=paper"),
     (r"^rollout .*\[tank,skirt\].*(dance_mixed|fabrics)", "an outfit, as in plie"),
     (r"^rollout .*plan=[0-9]", "a plan first, as hood plan makes it"),
     (r"^plan .*budget_ms", "the way to a budget from the same table"),
