@@ -14,6 +14,7 @@ from hood.contact.post_step import find_entered, hold_off, num_in_skin, signed_d
 from hood.contact.sample_points import PointContact, find_point_contact
 from hood.contact.second_side import find_second_side
 from hood.contact.self_contact import LayerPairs, SceneLayers, find_layers, find_sides, late_targets
+from hood.tensors.dense import sum_scenes
 
 #: Standard gravity [m/s²], y up.
 STANDARD_GRAVITY = 9.81
@@ -242,9 +243,7 @@ def sum_per_scene(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
     """
     if values.dtype in (torch.float16, torch.bfloat16):
         raise ValueError(f"energies cannot be computed in {values.dtype}; give positions in float32 or float64")
-    if num_scenes == 1 and values.device.type != "cpu":  # one kernel, in a fixed order; a GPU adds at an index as it comes
-        return values.sum().reshape(1)
-    return values.new_zeros(num_scenes).index_add(0, scene, values)
+    return sum_scenes(values, scene, num_scenes)
 
 
 def dot_rows(a: Tensor, b: Tensor) -> Tensor:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hood.tensors.dense import sum_scenes
+
 
 @dataclass(frozen=True)
 class Steps:
@@ -36,7 +38,7 @@ class Scenes:
         """Products of two (V, 3) scene by scene, spread to the vertices: (V, 1), or (1, 1) where there is one scene."""
         if len(self.sizes) == 1:
             return (a * b).sum().view(1, 1)
-        sums = a.new_zeros(len(self.sizes)).index_add(0, self.scene, (a * b).sum(dim=1))
+        sums = sum_scenes((a * b).sum(dim=1), self.scene, len(self.sizes))
         return sums[self.scene].unsqueeze(1)
 
     def limits(self, steps: Steps) -> Tensor | None:

@@ -11,6 +11,7 @@ Other factors of time in this module are of one core of an AMD server CPU.
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -93,6 +94,29 @@ def sum_rows(x: Tensor, order: Tensor, offsets: Tensor, weights: Tensor | None =
     bfloat16 are taken in float32.
     """
     return functional.embedding_bag(order, x, offsets, mode="sum", include_last_offset=True, per_sample_weights=weights)
+
+
+def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
+    """``target`` (M, …) with ``rows`` (N, …) added at ``index`` (N,), in the order of the rows.
+
+    A GPU adds at an index as it comes, and two runs differ in their last bits; so the rows are sorted by it there.
+    """
+    if target.device.type == "cpu":
+        return target.index_add(0, index, rows)
+    order = index.argsort(stable=True)
+    offsets = torch.searchsorted(index[order], torch.arange(len(target) + 1, device=index.device))
+    width = math.prod(target.shape[1:])
+    return target + sum_rows(rows.reshape(len(rows), width), order, offsets).reshape(target.shape)
+
+
+def sum_scenes(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
+    """Sum ``values`` (N,) of elements in ``scene`` (N,) to one value per scene (B,), in a fixed order on every device."""
+    if values.device.type == "cpu":
+        return values.new_zeros(num_scenes).index_add(0, scene, values)
+    if num_scenes == 1:  # one kernel
+        return values.sum().reshape(1)
+    here = scene == torch.arange(num_scenes, device=scene.device).unsqueeze(1)
+    return torch.where(here, values, 0.0).sum(dim=1)
 
 
 _whole = False

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,34 +39,48 @@ SLOW = {
 LEARNED = 1e-3
 
 
+#: Of a command of README and docs, most that vertices may be apart [m]; then of those whose steps end elsewhere on the way to
+#: the minimum: at the solver's target, at the limit of a plan, or when the time is up.
+DOCUMENTED = 1e-5
+FARTHER = {r"my_shirt\.obj .*material=denim": 5e-3, r"plan=0\.01": 5e-3, r"refine=\d+ms": 1e-2}
+#: What is refused: a plan made for one device is not taken on another.
+REFUSED = {r"plan=outputs/plan/plan\.json": "was made for the default of device"}
+
+
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Any:
-    """What came of a way, by its name."""
+def built(pytestconfig: pytest.Config) -> dict[str, str]:
+    """Where the stand-in is kept, compiled once for all runs of the tests, and what compiles it."""
     try:
         compiler = find_compiler()
     except BuildError as error:
         pytest.skip(str(error))
-    folder = tmp_path_factory.mktemp("device")
     assert pytestconfig.cache is not None
-    kept = pytestconfig.cache.mkdir("standin")  # compiled once for all runs of the tests
+    return {"STANDIN_BUILD": str(pytestconfig.cache.mkdir("standin")), "CXX": compiler}
+
+
+@pytest.fixture(scope="module")
+def ran(built: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What came of a way, by its name."""
+    folder = tmp_path_factory.mktemp("device")
 
     @functools.cache
     def run(name: str) -> dict[str, Any]:
-        return ask(folder, {"STANDIN_BUILD": str(kept), "CXX": compiler}, name)
+        (found,) = ask(built, "ways.py", folder, name)
+        assert "error" not in found, f"{found['text']}\n{found['error']}"
+        return found
 
     return run
 
 
-def ask(folder: Path, built: dict[str, str], name: str) -> dict[str, Any]:
-    path = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+def ask(built: dict[str, str], script: str, *words: str | Path) -> list[dict[str, Any]]:
+    """The lines that a script of this folder prints, in a process of its own."""
+    path = os.pathsep.join(map(str, (HERE, HERE.parents[1], HERE.parent, HERE.parent / "docs")))
     here = os.environ | built | {"PYTHONPATH": path, "HOOD_TRACEBACK": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, "-P", str(HERE / "ways.py"), str(folder), name], env=here, capture_output=True, text=True, check=False
+        [sys.executable, "-P", str(HERE / script), *map(str, words)], env=here, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    assert "error" not in found, f"{found['text']}\n{found['error']}"
-    return found
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 @pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
@@ -96,6 +111,29 @@ def test_an_evaluation_has_its_table(ran: Any) -> None:
 @pytest.mark.slow
 def test_the_benchmark_for_a_gpu_goes_through_its_jobs(ran: Any) -> None:
     assert {"ours plain", "ours captured", "newton 5 plain", "newton 5 captured"} <= set(ran("benchmark")["ways"])
+
+
+@pytest.mark.slow
+def test_every_command_of_the_docs_runs_there(built: dict[str, str], tmp_path: Path) -> None:
+    """Rollouts, trainings and evaluations: half an hour of a core."""
+    found = ask(built, "documented.py", tmp_path)
+    assert len(found) > 80
+    for one in found:
+        words = one["words"]
+        assert "error" not in one, f"{words}\n{one['text']}\n{one['error']}"
+        sentence = next((sentence for pattern, sentence in REFUSED.items() if re.search(pattern, words)), None)
+        if sentence is not None:
+            assert sentence in one["refused"], one
+            continue
+        assert set(one["codes"].values()) == {0}, (words, one["text"])
+        most = next((most for pattern, most in FARTHER.items() if re.search(pattern, words)), DOCUMENTED)
+        assert all(apart < most for apart in one.get("apart", {}).values()), (words, one["apart"])
+
+
+def test_sums_have_an_order(ran: Any) -> None:
+    found = ran("sums")
+    assert max(found["apart"]) < 1e-12
+    assert found["as they come"] == []
 
 
 def test_the_device_refuses_what_a_gpu_refuses(ran: Any) -> None:

@@ -102,9 +102,14 @@ def command(name: str, *words: str | Path) -> int:
 
 def apart(folder: Path) -> float:
     """Greatest distance [m] of vertices of the two rollouts; infinite where one is not finite."""
+    return between(*(folder / device / "rollout.h5" for device in ("cpu", "standin")))
+
+
+def between(*paths: Path) -> float:
+    """The same of two files."""
     from hood.rollouts.file.reader import read_rollout
 
-    first, second = (read_rollout(folder / device / "rollout.h5").cloth_pos for device in ("cpu", "standin"))
+    first, second = (read_rollout(path).cloth_pos for path in paths)
     most = float(abs(first - second).max())
     return most if most == most else float("inf")
 
@@ -168,6 +173,28 @@ def alone(_: Path) -> dict[str, object]:
     return {"refused": refused}
 
 
+def sums(_: Path) -> dict[str, object]:
+    """Sums at indices there and on the CPU: how far they are apart, and which of them a GPU would take as they come."""
+    from hood.tensors.dense import add_rows, sum_scenes
+
+    draw = torch.Generator().manual_seed(0)
+    apart = []
+    torch.standin.forget()
+    for count, places, shape in ((0, 3, (2,)), (1, 1, ()), (500, 7, (3, 3)), (500, 7, ())):
+        rows = torch.randn(count, *shape, generator=draw, dtype=torch.float64)
+        index = torch.randint(places, (count,), generator=draw)
+        for function, given in (
+            (add_rows, (torch.ones(places, *shape, dtype=torch.float64), index, rows)),
+            *([] if shape else [(sum_scenes, (rows, index, places))]),
+        ):
+            there = function(*(one.to("standin") if isinstance(one, torch.Tensor) else one for one in given))
+            apart.append(float((there.cpu() - function(*given)).abs().max()))
+    return {
+        "apart": apart,
+        "as they come": [name for name in torch.standin.counts() if "index_add" in name or "scatter" in name],
+    }
+
+
 def raises(function: Callable[[], object]) -> bool:
     try:
         function()
@@ -176,7 +203,7 @@ def raises(function: Callable[[], object]) -> bool:
     return False
 
 
-OTHERS = {"training": train, "evaluation": evaluate, "benchmark": benchmark, "the device alone": alone}
+OTHERS = {"training": train, "evaluation": evaluate, "benchmark": benchmark, "the device alone": alone, "sums": sums}
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]), sys.argv[2:])

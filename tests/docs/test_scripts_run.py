@@ -79,6 +79,12 @@ RUN = (
     Run(r"benchmarks/plan\.py", "--scenes tank_plie --frames 6 --accuracy none", r"same bits in 1 of 1"),
     Run(r"precision\.py", "", r"\| met \|"),
     Run(r"record_ranges\.py", "", r"trained on fps", (r"FILE KEY=VALUE …", "FILE.safetensors model=small model.latent_dim=8")),
+    Run(
+        r"first_steps\.py",
+        "trainer.statistics_iterations=1 data.garments=[tank]",
+        r"relaxing +2 (.|\n)*regular +2 ",
+        (r"first_steps\.py 100", "first_steps.py 4"),
+    ),
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),

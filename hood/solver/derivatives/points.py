@@ -20,6 +20,7 @@ from hood.energies.term import Form, having
 from hood.energies.wind import Drag
 from hood.solver.derivatives.vertices import VertexForces, VertexModel
 from hood.solver.system.sparsity import BlockPattern
+from hood.tensors.dense import add_rows
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,12 @@ class PointForces:
     def spread(self, gradient: Tensor, like: Tensor) -> Tensor:
         """Gradients (N, 3) by the points as one by vertices ``like`` (V, 3)."""
         shares = self.weights.unsqueeze(2) * gradient.unsqueeze(1)
-        return torch.zeros_like(like).index_add(0, self.vertices.reshape(-1), shares.reshape(-1, 3))
+        return add_rows(torch.zeros_like(like), self.vertices.reshape(-1), shares.reshape(-1, 3))
 
     def spread_blocks(self, matrix: Tensor, num_vertices: int) -> Tensor:
         """Diagonal blocks (V, 3, 3) of the vertices, of matrices (N, 3, 3) by the points."""
         shares = self.weights[:, :, None, None] ** 2 * matrix.unsqueeze(1)
-        return matrix.new_zeros(num_vertices, 3, 3).index_add(0, self.vertices.reshape(-1), shares.reshape(-1, 3, 3))
+        return add_rows(matrix.new_zeros(num_vertices, 3, 3), self.vertices.reshape(-1), shares.reshape(-1, 3, 3))
 
 
 def point_forces(potential: Potential, problem: StepProblem) -> tuple[PointForces, ...]:
@@ -95,7 +96,7 @@ class PointBlocks:
     def add(self, triples: Tensor, matrix: Tensor) -> Tensor:
         """``triples`` (R, 3) of the pattern with matrices (N, 3, 3) by the points."""
         blocks = self.products.to(matrix)[:, :, None, None] * matrix[:, None]
-        return triples.index_add(0, self.target, blocks.reshape(-1, 3)[self.kept])
+        return add_rows(triples, self.target, blocks.reshape(-1, 3)[self.kept])
 
 
 def point_blocks(pattern: BlockPattern, vertices: np.ndarray, weights: Tensor, unknown: np.ndarray) -> PointBlocks:

@@ -19,6 +19,7 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerGrips, has_layers
 from hood.energies.term import Form, having
+from hood.tensors.dense import add_rows
 
 
 def layers_of(potential: Potential, problem: StepProblem) -> tuple[SceneLayers, ...]:
@@ -50,7 +51,7 @@ class LayerRows:
         along = (self.normals * padded[self.vertices]).sum(dim=2)
         others = along.sum(dim=1, keepdim=True) - along
         parts = (others.unsqueeze(2) * self.normals).reshape(-1, 3)
-        return torch.zeros_like(padded).index_add(0, self.vertices.reshape(-1), parts)[:-1]
+        return add_rows(torch.zeros_like(padded), self.vertices.reshape(-1), parts)[:-1]
 
 
 def layer_rows(layers: tuple[SceneLayers, ...], grips: LayerGrips | None, pos: Tensor, unknown: np.ndarray) -> LayerRows | None:
@@ -74,7 +75,7 @@ def layer_rows(layers: tuple[SceneLayers, ...], grips: LayerGrips | None, pos: T
     number = np.where(number < 0, num_free, number)
     index, n = torch.as_tensor(number, device=pos.device), torch.as_tensor(row).to(pos)
     blocks = (n.unsqueeze(3) * n.unsqueeze(2)).reshape(-1, 3, 3)
-    own = pos.new_zeros(num_free + 1, 3, 3).index_add(0, index.reshape(-1), blocks)[:-1]
+    own = add_rows(pos.new_zeros(num_free + 1, 3, 3), index.reshape(-1), blocks)[:-1]
     return LayerRows(index, n, own)
 
 

@@ -9,6 +9,7 @@ from hood.energies.contact import Walls
 from hood.energies.laws import contact_push
 from hood.solver.derivatives.points import PointForces
 from hood.solver.system.iterate import Iterate, Unknowns
+from hood.tensors.dense import add_rows
 
 ARMIJO = 1e-4
 BACKTRACKS = 40
@@ -117,9 +118,9 @@ class _PointStop:
         points = self._points
         push = contact_push(self._wall.weight, self._depth, self._wall.depth(points.at(pos)), self._compliance)
         target = points.vertices.reshape(-1)
-        total = torch.zeros_like(pos).index_add(0, target, (push[:, None, None] * self._give).reshape(-1, 3))
+        total = add_rows(torch.zeros_like(pos), target, (push[:, None, None] * self._give).reshape(-1, 3))
         asked = ((push > 0)[:, None] & (points.weights > 0)).to(pos.dtype).reshape(-1)
-        count = pos.new_zeros(len(pos)).index_add(0, target, asked)
+        count = add_rows(pos.new_zeros(len(pos)), target, asked)
         return total / count.clamp_min(1.0)[:, None]
 
 

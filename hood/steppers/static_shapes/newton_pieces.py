@@ -287,4 +287,4 @@ class FixedSystem:
         return (a * b).sum().reshape(1) if self._num_scenes == 1 else self._sum((a * b).sum(dim=1), self._scene)
 
     def _sum(self, values: Tensor, scene: Tensor) -> Tensor:
-        return values.sum().reshape(1) if self._num_scenes == 1 else sum_per_scene(values, scene, self._num_scenes)
+        return sum_per_scene(values, scene, self._num_scenes)
