@@ -11,7 +11,7 @@ on to a relative gradient of 1e-3, at most 60 iterations. Printed are, for relax
   and for the network's,
 - energy above the minimum over e0 (γ) of both, medians,
 - the mean cosine between the gradients that two of the scenes have for the weights: 1 where they agree, 0 where what
-  one scene asks for tells nothing about the next. About 1 / cosine scenes are one direction's worth.
+  one scene asks for tells nothing about the next. With ``trainer.batch_size`` it is of whole updates.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Step:
 
 
 class Look:
-    """Told every step of a training by its ``observe``."""
+    """Told every step of a training by its ``observe``; ``weights`` are those whose gradients are compared."""
 
     def __init__(self, trainer: Trainer) -> None:
         self.trainer, self.steps = trainer, list[Step]()
@@ -76,13 +76,13 @@ class Look:
 
 
 def energy(potential: Potential, problem: StepProblem, pos: Tensor) -> float:
-    """Φ over e0, the mean over scenes."""
+    """Φ over e0 at ``pos`` (V, 3) m, the mean over scenes."""
     _, energies = potential.gradient(problem, pos, problem.acceleration(pos))
     return float((sum(energies.values()) / scale(problem)).mean())
 
 
 def sizes(problem: StepProblem, moved: Tensor) -> tuple[float, float]:
-    """Median and 99th percentile [mm] of the free vertices."""
+    """Median and 99th percentile [mm] of lengths of ``moved`` (V, 3) m over the free vertices."""
     lengths = 1e3 * torch.linalg.vector_norm(moved, dim=1)[problem.cloth.free]
     return float(lengths.median()), float(lengths.quantile(0.99))
 

@@ -110,7 +110,10 @@ def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
 
 
 def sum_scenes(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
-    """Sum ``values`` (N,) of elements in ``scene`` (N,) to one value per scene (B,), in a fixed order on every device."""
+    """Sum ``values`` (N,) of elements in ``scene`` (N,) to one value per scene (B,), in a fixed order on every device.
+
+    On a GPU that takes B × N numbers for a moment: adding at an index would take N, and other bits in every run.
+    """
     if values.device.type == "cpu":
         return values.new_zeros(num_scenes).index_add(0, scene, values)
     if num_scenes == 1:  # one kernel
