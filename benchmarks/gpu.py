@@ -7,15 +7,16 @@ The embedded dress, refined to the given number of vertices, on the embedded bod
 of a rollout of the solver. Rows come in the order of their importance, each printed and written to the CSV file at once, until
 the minutes are over; what was left out is said at the end. Columns:
 
-``way``       of a network: ``plain``; ``captured``: fixed shapes, one CUDA graph; ``fused``: the same with the edge update in
-              Triton. Of the solver, with so many Newton iterations: ``plain``; ``captured``: a graph for each of its pieces.
+``way``       of a network: ``plain``; ``captured``: fixed shapes, one CUDA graph; ``fused``: the same with the network's
+              steps in Triton; ``compiled``: that by torch.compile. Of the solver, with so many Newton iterations: ``plain``;
+              ``captured``: a graph for each of its pieces.
 ``ms``        of a frame, search included, metrics not: median of wall-clock time between two waits for the device, ways taking
               turns state by state.
 ``floor ms``  what the frame's kernels take at least, one after the other: for each the longest of the gap between two kernels,
               its bytes over the bandwidth, its operations over their rate (``benchmarks/roofline.py``). On a
               GPU all of these constants are measured first, in this very run; else they are those of ``--device-specs``.
 ``share``     floor / ms: how near the frame is to the roofline.
-``kernels``   of the traced frame, views not counted; of fused rows those before fusion.
+``kernels``   of the traced frame, views not counted; of fused and compiled rows those before fusion.
 ``launches``  calls of the CUDA runtime that start something.
 ``gamma``     median gap of the step's positions to the minimum of the potential, see :mod:`hood.evaluation.gap`.
 
@@ -31,7 +32,7 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -71,6 +72,7 @@ from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"
 WAYS = ("plain", "captured", "fused")
+COMPILED = "compiled"  # takes a minute or two to make, so it is measured at one size
 FIRST_FRAME, LEAD = 10, 3
 ITERATIONS = (1, 2, 5, 10)
 _LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernelEx",
@@ -229,7 +231,7 @@ def solver_settings(iterations: int) -> NewtonSettings:
 
 @contextmanager
 def edges_fused(on: bool) -> Iterator[None]:
-    """Triton for edge steps inside, or not."""
+    """Triton for the network's steps inside, or not."""
     before = os.environ.get(SWITCH)
     os.environ[SWITCH] = "on" if on else "off"
     try:
@@ -240,7 +242,7 @@ def edges_fused(on: bool) -> Iterator[None]:
 
 @contextmanager
 def in_way(name: str) -> Iterator[None]:
-    with edges_fused(name == "fused"):
+    with edges_fused(name in ("fused", COMPILED)):
         yield
 
 
@@ -305,16 +307,18 @@ def time_ways(calls: dict[str, Callable[[StepProblem], Tensor]], problems: list[
 
 
 @torch.no_grad()
-def network_rows(table: Table, bench: Bench, model: str, precision: str, device: Device, on_gpu: bool) -> None:
+def network_rows(
+    table: Table, bench: Bench, model: str, precision: str, device: Device, on_gpu: bool, ways: Sequence[str] = WAYS
+) -> None:
     simulator = load_simulator(locate("weights", model)).eval()
     simulator.network.use_precision("fp32" if not on_gpu and precision == "tf32" else precision)
     work, problems = bench.work_of(model, simulator, precision), bench.on_device()
     if on_gpu:
         simulator = simulator.to("cuda")
     prepared: Prepared = simulator.prepare(bench.there.cloth, bench.scene.garment.rest_pos)
-    ways = [way for way in WAYS if way != "fused" or (on_gpu and find_spec("triton") is not None)]
+    ways = [way for way in ways if way in ("plain", "captured") or (on_gpu and find_spec("triton") is not None)]
     steppers: dict[str, Stepper] = {
-        way: simulator if way == "plain" else CapturedSimulator(simulator, "captured" if on_gpu else "fixed") for way in ways
+        way: simulator if way == "plain" else CapturedSimulator(simulator, _mode(way, on_gpu)) for way in ways
     }
     calls = {way: partial(_step, stepper, prepared) for way, stepper in steppers.items()}
     times = time_ways(calls, problems) if on_gpu else {}
@@ -324,6 +328,10 @@ def network_rows(table: Table, bench: Bench, model: str, precision: str, device:
             gamma = bench.gamma([call(problem) for problem in problems])
         floor = 1e3 * device.seconds(work, precision, captured=way != "plain")
         table.add(_row(bench, model, precision, way, work, floor, times.get(way), launches, gamma))
+
+
+def _mode(way: str, on_gpu: bool) -> str:
+    return ("compiled" if way == COMPILED else "captured") if on_gpu else "fixed"
 
 
 def _step(stepper: Stepper, prepared: Prepared | None, problem: StepProblem) -> Tensor:
@@ -396,6 +404,7 @@ def jobs(sizes: list[int], models: list[str]) -> list[tuple[int, str, str | int]
     first: list[tuple[int, str, str | int]] = []
     for size in sizes:
         first += [(size, models[0], "fp32"), (size, SOLVER, 5)]
+    first += [(sizes[0], model, COMPILED) for model in models[:2]]
     rest: list[tuple[int, str, str | int]] = []
     for size in sizes:
         rest += [(size, model, "fp32") for model in models[1:]]
@@ -420,7 +429,9 @@ def run(args: argparse.Namespace, on_gpu: bool) -> None:
             benches[size] = Bench(size, "cuda" if on_gpu else "cpu", 1 if size > 20000 else 3)
         if kind == SOLVER:
             solver_rows(table, benches[size], int(choice), device, on_gpu)
-        else:
+        elif choice == COMPILED and on_gpu:
+            network_rows(table, benches[size], kind, "fp32", device, on_gpu, ("plain", COMPILED))
+        elif choice != COMPILED:
             network_rows(table, benches[size], kind, str(choice), device, on_gpu)
     print("\n" + "\n".join(crossover(table.rows)))
     if left:

@@ -55,7 +55,7 @@ FUNCTIONS = {
     "hood.steppers.network.build_simulator": "the arguments of a model's config, each with its default, are named once",
     "hood.cloth.cloth.build_cloth": "one table: every property of a cloth and where it comes from",
     "hood.app.rollout._simulate_to_disk": "the files of a rollout are opened, filled and closed in one place",
-    "hood.model.kernels.triton_kernels.tile_pass": "a Triton kernel is one function",
+    "hood.model.kernels.triton_kernels.edges_pass": "a Triton kernel is one function",
     "hood.api.simulate": "its docstring: arguments, errors, an example",
     "hood.assets.motion.load.load_sequence": "its docstring: arguments, errors, an example",
 }

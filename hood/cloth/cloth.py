@@ -19,6 +19,7 @@ from hood.cloth.fabric import FabricMap
 from hood.mesh import geometry, topology
 from hood.mesh.editing.quality import check_triangles
 from hood.tensors.batch import concatenate, indexes
+from hood.tensors.dense import add_rows
 
 #: A face within this sine of the horizontal has its warp along z: the vertical does not tell one there.
 _LEVEL = 0.1
@@ -129,7 +130,7 @@ class Cloth:
         """Mean square [m²] (V,) of the rest lengths of the edges at every vertex; 0 at isolated ones."""
         start, end = self.edges.unbind(dim=1)
         ends = torch.stack([self.rest_edge_sq, torch.ones_like(self.rest_edge_sq)], dim=1)
-        total = ends.new_zeros(self.num_vertices, 2).index_add(0, start, ends).index_add(0, end, ends)
+        total = add_rows(add_rows(ends.new_zeros(self.num_vertices, 2), start, ends), end, ends)
         return total[:, 0] / total[:, 1].clamp_min(1.0)
 
     @cached_property

@@ -20,6 +20,7 @@ from hood.contact.contact import Contact, match_surface
 from hood.mesh import topology
 from hood.mesh.closest_point.search import build_incidence
 from hood.mesh.geometry import normals_of_fans, vertex_masses
+from hood.tensors.dense import add_rows
 from hood.tensors.weak_cache import forget
 
 #: Where the cloth meets the body: at its vertices alone; at the midpoints of its edges as well; at the midpoints of its rims
@@ -97,7 +98,7 @@ def _midpoints(cloth: Cloth) -> _Midpoints:
     faces, edges = cloth.faces.cpu().numpy(), cloth.edges.cpu().numpy()
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     side = torch.as_tensor(topology.edge_index(edges, sides), device=cloth.faces.device)
-    area = cloth.rest_area.new_zeros(len(edges)).index_add(0, side, cloth.rest_area.repeat_interleave(3) / 3.0)
+    area = add_rows(cloth.rest_area.new_zeros(len(edges)), side, cloth.rest_area.repeat_interleave(3) / 3.0)
     share = area / vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[cloth.edges].mean(dim=1)
     rim = torch.as_tensor(np.bincount(side.cpu().numpy(), minlength=len(edges)) == 1, device=share.device)
     made = _Midpoints(cloth.edges[:, [0, 1, 1]], share, cloth.edge_scene, rim)

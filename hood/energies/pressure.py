@@ -15,6 +15,7 @@ from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.topology import boundary_loops, connected_components
+from hood.tensors.dense import add_rows
 from hood.tensors.weak_cache import forget
 
 #: Pascal, one atmosphere: no garment holds more.
@@ -94,7 +95,7 @@ class ClosedSurface:
 
     def points(self, pos: Tensor) -> Tensor:
         """``pos`` (V, 3) with the means of the rims (V + R, 3) after them."""
-        means = pos.new_zeros(self.num_rims, 3).index_add(0, self.mean, self.share.to(pos)[:, None] * pos[self.rims])
+        means = add_rows(pos.new_zeros(self.num_rims, 3), self.mean, self.share.to(pos)[:, None] * pos[self.rims])
         return torch.cat([pos, means])
 
     def to_vertices(self, values: Tensor, num_vertices: int) -> Tensor:
@@ -114,9 +115,8 @@ class ClosedSurface:
         points = self.points(pos)
         x = points[self.corners]
         # The volume does not depend on the point, which thus has no slope; near it numbers are small.
-        sums = pos.new_zeros(self.num_pieces, 4).index_add(
-            0, self.piece, torch.cat([x.detach().mean(dim=1), torch.ones_like(x[:, 0, :1])], dim=1)
-        )
+        of_triangles = torch.cat([x.detach().mean(dim=1), torch.ones_like(x[:, 0, :1])], dim=1)
+        sums = add_rows(pos.new_zeros(self.num_pieces, 4), self.piece, of_triangles)
         inside = (sums[:, :3] / sums[:, 3:])[self.piece]
         a, b, c = (x - inside[:, None]).unbind(dim=1)
         return (a * torch.linalg.cross(b, c)).sum(dim=1) / 6.0
@@ -146,11 +146,11 @@ class Inflation:
         x, index = points[surface.corners], surface.corners.reshape(-1)
         # Of a closed surface a vertex has a third of the area around it, however far it is from the origin.
         third = torch.linalg.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) / 6.0
-        slope = torch.zeros_like(points).index_add(0, index, -self.pascal * third.repeat_interleave(3, dim=0))
+        slope = add_rows(torch.zeros_like(points), index, -self.pascal * third.repeat_interleave(3, dim=0))
         # From the middle of an edge to the opposite vertex of either face is at least half of the way between the two.
         median = torch.linalg.vector_norm(1.5 * (x - x.mean(dim=1, keepdim=True)), dim=2)
         size = max(-self.pascal, 0.0) / 6.0 * (median.sum(dim=1, keepdim=True) - median)
-        bound = surface.to_vertices(points.new_zeros(len(points)).index_add(0, index, size.reshape(-1)), len(pos))
+        bound = surface.to_vertices(add_rows(points.new_zeros(len(points)), index, size.reshape(-1)), len(pos))
         return surface.to_vertices(slope, len(pos)), torch.diag_embed(bound[:, None].expand(-1, 3))
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.native import features
+from hood.tensors.dense import sum_of_rows
 from hood.tensors.weak_cache import forget
 
 
@@ -33,7 +34,7 @@ class Diffusion:
         return values
 
     def _sum(self, values: Tensor) -> Tensor:
-        return torch.zeros_like(values).index_add(0, self._receivers, values.index_select(0, self._senders))
+        return sum_of_rows(values, self._receivers, self._senders, len(values))
 
 
 class _Neighbours(NamedTuple):

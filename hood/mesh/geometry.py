@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hood.tensors.dense import add_rows, sum_of_rows
+
 if TYPE_CHECKING:
     from hood.mesh.closest_point.search import Incidence
 
@@ -37,10 +39,8 @@ def face_normals(pos: Tensor, faces: Tensor) -> Tensor:
 def vertex_normals(pos: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals (V, 3); zero where undefined (isolated vertex, cancelling faces)."""
     cross = _cross(pos, faces)
-    total = pos.new_zeros(pos.shape)
-    for corner in range(3):
-        total = total.index_add(0, faces[:, corner], cross)
-    return _unit(total)
+    rows = torch.arange(len(faces), device=faces.device).repeat(3)
+    return _unit(sum_of_rows(cross, faces.t().reshape(-1), rows, len(pos)))
 
 
 def normals_of_fans(pos: Tensor, faces: Tensor, around: Tensor, first: Tensor, rows: Tensor | None = None) -> Tensor:
@@ -69,7 +69,7 @@ def vertex_masses(rest_pos: Tensor, faces: Tensor, density: Tensor | float) -> T
     share = triangle_areas(rest_pos, faces) * density / 3.0
     mass = rest_pos.new_zeros(rest_pos.shape[0])
     for corner in range(3):
-        mass = mass.index_add(0, faces[:, corner], share)
+        mass = add_rows(mass, faces[:, corner], share)
     return mass
 
 

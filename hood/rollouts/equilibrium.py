@@ -24,6 +24,7 @@ from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.retry import minimize_held_off
 from hood.solver.step_figures import NOT_FINITE
 from hood.tensors.batch import to_device
+from hood.tensors.dense import add_rows
 
 #: Steps begin with the first and grow to the second [s]; they last longer while no vertex moves much farther than the third
 #: [m] in one: contact is searched once a step, and finds the body within a decimetre.
@@ -218,7 +219,7 @@ class _Parts:
 
     def means(self, values: Tensor) -> Tensor:
         """Means (P,) of ``values`` (V,) over the free vertices of every part; 0 where there are none."""
-        total = values.new_zeros(len(self._size)).index_add(0, self._free_part, values[self.free])
+        total = add_rows(values.new_zeros(len(self._size)), self._free_part, values[self.free])
         return total / self._size.clamp_min(1)
 
     def lost(self, moved: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from hood.scene.start import free_stretch, leave_by_centroids, settle
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 from hood.scene.worn import worst_part
 from hood.tensors.batch import to_device
+from hood.tensors.dense import add_rows
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
@@ -283,7 +284,7 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
 def recentre(state: State, vertex_scene: Tensor) -> State:
     """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
     count = torch.bincount(vertex_scene, minlength=len(state.origin)).clamp_min(1)
-    centre = state.pos.new_zeros(len(state.origin), 3).index_add(0, vertex_scene, state.pos) / count[:, None]
+    centre = add_rows(state.pos.new_zeros(len(state.origin), 3), vertex_scene, state.pos) / count[:, None]
     # A broken cloth has no centre; its frame stays, so that the body can still be seen.
     shift = torch.round(centre.nan_to_num(0.0, 0.0, 0.0) / (2 * _GRID)) * (2 * _GRID)
     if not bool(shift.any()):

@@ -101,7 +101,7 @@ def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
 
     A GPU adds at an index as it comes, and two runs differ in their last bits; so the rows are sorted by it there.
     """
-    if target.device.type == "cpu":
+    if target.device.type == "cpu" and not _whole:
         return target.index_add(0, index, rows)
     order = index.argsort(stable=True)
     offsets = torch.searchsorted(index[order], torch.arange(len(target) + 1, device=index.device))
@@ -109,12 +109,20 @@ def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
     return target + sum_rows(rows.reshape(len(rows), width), order, offsets).reshape(target.shape)
 
 
+def sum_of_rows(values: Tensor, index: Tensor, chosen: Tensor, count: int) -> Tensor:
+    """Σ ``values[chosen]`` at ``index``, (count, C) for ``values`` (M, C) and both (N,), in the order of the list."""
+    if values.device.type == "cpu" and not _whole:
+        return values.new_zeros(count, values.shape[1]).index_add(0, index, values.index_select(0, chosen))
+    order = index.argsort(stable=True)
+    return sum_rows(values, chosen[order], torch.searchsorted(index[order], torch.arange(count + 1, device=index.device)))
+
+
 def sum_scenes(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
     """Sum ``values`` (N,) of elements in ``scene`` (N,) to one value per scene (B,), in a fixed order on every device.
 
     On a GPU that takes B × N numbers for a moment: adding at an index would take N, and other bits in every run.
     """
-    if values.device.type == "cpu":
+    if values.device.type == "cpu" and not _whole:
         return values.new_zeros(num_scenes).index_add(0, scene, values)
     if num_scenes == 1:  # one kernel
         return values.sum().reshape(1)

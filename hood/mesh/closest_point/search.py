@@ -19,6 +19,7 @@ from torch import Tensor
 
 from hood.mesh import topology
 from hood.mesh.closest_point import tree as surface_tree
+from hood.tensors.dense import sum_scenes
 
 NUM_NEAREST = 3
 #: Scenes up to this many faces, and faces with an edge longer than this many mean edges, are tested
@@ -318,7 +319,7 @@ def _exhaustive(
     num_scenes = int(max(vertex_scene.max(), point_scene.max())) + 1
     counts = torch.bincount(face_scene, minlength=num_scenes)
     length = fans.uu.sqrt().mean(dim=1)
-    mean = length.new_zeros(num_scenes).index_add_(0, vertex_scene, length)
+    mean = sum_scenes(length, vertex_scene, num_scenes)
     mean /= torch.bincount(vertex_scene, minlength=num_scenes).clamp_min(1)
     limit_sq = (LARGE_EDGE_RATIO * mean[vertex_scene]) ** 2
     oversized = (fans.uu.amax(dim=1) > limit_sq) & (incidence.valence > 0)

@@ -23,6 +23,7 @@ from hood.mesh.closest_point.search import (
     weights_and_offset,
 )
 from hood.tensors.batch import gather_true
+from hood.tensors.dense import sum_scenes
 
 
 @torch.no_grad()
@@ -96,8 +97,8 @@ def _exhaustive(
 ) -> Tensor:
     """Faces (G,) to test against every point of their scene: all of a small scene, else those at oversized edges."""
     length = fans.uu.sqrt().mean(dim=1)
-    total = length.new_zeros(num_scenes).index_add(0, vertex_scene, length)
-    mean = total / length.new_zeros(num_scenes).index_add(0, vertex_scene, torch.ones_like(length)).clamp_min(1.0)
+    total = sum_scenes(length, vertex_scene, num_scenes)
+    mean = total / sum_scenes(torch.ones_like(length), vertex_scene, num_scenes).clamp_min(1.0)
     limit_sq = (LARGE_EDGE_RATIO * mean.index_select(0, vertex_scene)) ** 2
     oversized = (fans.uu.amax(dim=1) > limit_sq) & (incidence.valence > 0)
     count = face_scene.new_zeros(num_scenes).index_add(0, face_scene, torch.ones_like(face_scene))

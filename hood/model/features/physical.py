@@ -21,6 +21,7 @@ from hood.model.features.groups import (
 )
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import FixedScale
+from hood.tensors.dense import add_rows
 
 GRAVITY = 9.81
 
@@ -241,7 +242,7 @@ def mean_rest_length(inputs: Inputs) -> Tensor:
     """Mean rest length [m] of the edges in the same set and scene, at least 1 µm, per edge (N, 1)."""
     edges, rest = inputs.edges, rest_length(inputs)
     ends = torch.cat([rest, torch.ones_like(rest)], dim=1)
-    total = rest.new_zeros(edges.num_segments, 2).index_add_(0, edges.segment, ends)
+    total = add_rows(rest.new_zeros(edges.num_segments, 2), edges.segment, ends)
     return (total[:, :1] / total[:, 1:].clamp_min(1.0)).index_select(0, edges.segment).clamp_min(1e-6)
 
 

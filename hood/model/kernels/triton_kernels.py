@@ -1,4 +1,4 @@
-"""The kernels behind :mod:`hood.model.kernels.triton_edge`; importing this module needs Triton.
+"""The kernels behind :mod:`hood.model.kernels.triton_step`; importing this module needs Triton.
 
 No annotations from the future here: Triton reads the annotations of a kernel's constants.
 """
@@ -31,11 +31,44 @@ def _vector(pointer, columns, present):
 
 
 @triton.jit
-def tile_pass(
+def _tail(
+    hidden,
+    weight_2,
+    bias_2,
+    weight_3,
+    bias_3,
+    scale,
+    shift,
+    columns,
+    present,
+    eps,
+    dtype,
+    PRECISION: tl.constexpr,
+    WIDEN: tl.constexpr,
+    WIDTH: tl.constexpr,
+):
+    """The network behind its first layer, the layer norm included, in float32; ``hidden`` in float32, before its ReLU."""
+    hidden = tl.maximum(hidden, 0.0).to(dtype)
+    hidden = _layer(hidden, weight_2, WIDTH, columns, present, PRECISION, WIDEN)
+    hidden = tl.maximum(hidden + _vector(bias_2, columns, present)[None, :], 0.0).to(dtype)
+    raw = _layer(hidden, weight_3, WIDTH, columns, present, PRECISION, WIDEN)
+    raw += _vector(bias_3, columns, present)[None, :]
+    centred = tl.where(present[None, :], raw - (tl.sum(raw, axis=1) / WIDTH)[:, None], 0.0)
+    variance = tl.sum(centred * centred, axis=1) / WIDTH
+    out = centred * (1.0 / tl.sqrt(variance + eps))[:, None] * _vector(scale, columns, present)[None, :]
+    return out + _vector(shift, columns, present)[None, :]
+
+
+@triton.jit
+def edges_pass(
     latent,
-    table,
+    tables,
+    stride,
+    column,
     receivers,
     senders,
+    local_receivers,
+    chosen,
     weight_1,
     stride_1,
     weight_2,
@@ -44,7 +77,6 @@ def tile_pass(
     bias_3,
     scale,
     shift,
-    updated,
     received,
     borders,
     count,
@@ -55,6 +87,7 @@ def tile_pass(
     WIDTH: tl.constexpr,
     PADDED: tl.constexpr,
     TILE: tl.constexpr,
+    SOME: tl.constexpr,
 ):
     """New latents of TILE edges; sums at the nodes of which the tile holds all edges; partial sums at its two ends."""
     tile = tl.program_id(0)
@@ -63,37 +96,35 @@ def tile_pass(
     columns = tl.arange(0, PADDED)
     present = columns < WIDTH
     both = inside[:, None] & present[None, :]
-    places = rows[:, None].to(tl.int64) * WIDTH + columns[None, :]
+    if SOME:
+        owned = tl.load(chosen + rows, mask=inside, other=0).to(tl.int64)
+    else:
+        owned = rows.to(tl.int64)
+    places = owned[:, None] * WIDTH + columns[None, :]
     dtype = latent.dtype.element_ty
 
-    receiver = tl.load(receivers + rows, mask=inside, other=-1)
-    sender = tl.load(senders + rows, mask=inside, other=0)
+    node = tl.load(receivers + rows, mask=inside, other=0).to(tl.int64)
+    sender = tl.load(senders + rows, mask=inside, other=0).to(tl.int64)
     edge = tl.load(latent + places, mask=both, other=0.0)
-    hidden = tl.load(table + receiver[:, None] * (2 * WIDTH) + columns[None, :], mask=both, other=0.0).to(tl.float32)
-    hidden += tl.load(table + sender[:, None] * (2 * WIDTH) + WIDTH + columns[None, :], mask=both, other=0.0).to(tl.float32)
+    at_ends = tables + column + columns[None, :]
+    hidden = tl.load(at_ends + node[:, None] * stride, mask=both, other=0.0).to(tl.float32)
+    hidden += tl.load(at_ends + WIDTH + sender[:, None] * stride, mask=both, other=0.0).to(tl.float32)
     hidden += _layer(edge, weight_1, stride_1, columns, present, PRECISION, WIDEN)
-    hidden = tl.maximum(hidden, 0.0).to(dtype)
-    hidden = _layer(hidden, weight_2, WIDTH, columns, present, PRECISION, WIDEN)
-    hidden = tl.maximum(hidden + _vector(bias_2, columns, present)[None, :], 0.0).to(dtype)
-    raw = _layer(hidden, weight_3, WIDTH, columns, present, PRECISION, WIDEN)
-    raw += _vector(bias_3, columns, present)[None, :]
-
-    centred = tl.where(present[None, :], raw - (tl.sum(raw, axis=1) / WIDTH)[:, None], 0.0)
-    variance = tl.sum(centred * centred, axis=1) / WIDTH
-    message = centred * (1.0 / tl.sqrt(variance + eps))[:, None] * _vector(scale, columns, present)[None, :]
-    message += _vector(shift, columns, present)[None, :]
-    tl.store(updated + places, (edge.to(tl.float32) + message).to(dtype), mask=both)
+    rest = (weight_2, bias_2, weight_3, bias_3, scale, shift)
+    message = _tail(hidden, *rest, columns, present, eps, dtype, PRECISION, WIDEN, WIDTH)
+    tl.store(latent + places, (edge.to(tl.float32) + message).to(dtype), mask=both)
 
     # Row i of the sums is that of all edges of the tile with the receiver of edge i: a product with a matrix of 0 and 1.
-    same = (receiver[:, None] == tl.load(receivers + rows, mask=inside, other=-2)[None, :]).to(tl.float32).to(dtype)
+    receiver = tl.load(local_receivers + rows, mask=inside, other=-1)
+    same = (receiver[:, None] == tl.load(local_receivers + rows, mask=inside, other=-2)[None, :]).to(tl.float32).to(dtype)
     sums = _product(same, message.to(dtype), PRECISION, WIDEN)
-    before = tl.load(receivers + rows - 1, mask=inside & (rows > 0), other=-1)
+    before = tl.load(local_receivers + rows - 1, mask=inside & (rows > 0), other=-1)
     stop = tl.minimum((tile + 1) * TILE, count)
-    last = tl.load(receivers + stop - 1)
-    after = tl.load(receivers + stop, mask=stop < count, other=-1)
+    last = tl.load(local_receivers + stop - 1)
+    after = tl.load(local_receivers + stop, mask=stop < count, other=-1)
     unfinished = tl.where(after == last, last, -2)  # the node whose edges go on in the next tile, if there is one
     whole = inside & (receiver != before) & (receiver != unfinished)
-    tl.store(received + receiver[:, None] * WIDTH + columns[None, :], sums.to(dtype), mask=whole[:, None] & present[None, :])
+    tl.store(received + node[:, None] * WIDTH + columns[None, :], sums.to(dtype), mask=whole[:, None] & present[None, :])
     ends = borders + tile * WIDTH + columns[None, :] + tl.zeros((TILE, 1), tl.int32)
     tl.store(ends, sums, mask=(rows == tile * TILE)[:, None] & present[None, :])
     tl.store(ends + tiles * WIDTH, sums, mask=(rows == stop - 1)[:, None] & present[None, :])
@@ -102,10 +133,10 @@ def tile_pass(
 @triton.jit
 def border_pass(
     receivers,
+    local_receivers,
     offsets,
     borders,
     received,
-    count,
     tiles,
     WIDTH: tl.constexpr,
     PADDED: tl.constexpr,
@@ -117,9 +148,9 @@ def border_pass(
     columns = tl.arange(0, PADDED)
     present = columns < WIDTH
     stop = (tile + 1) * TILE
-    node = tl.load(receivers + stop - 1)
-    begins = tl.load(offsets + node) >= tile * TILE
-    end = tl.load(offsets + node + 1)
+    local = tl.load(local_receivers + stop - 1)
+    begins = tl.load(offsets + local) >= tile * TILE
+    end = tl.load(offsets + local + 1)
     if begins & (end > stop):
         total = tl.load(borders + (tiles + tile) * WIDTH + columns, mask=present, other=0.0)
         final = (end - 1) // TILE
@@ -129,4 +160,80 @@ def border_pass(
             mask = (others <= final)[:, None] & present[None, :]
             total += tl.sum(tl.load(borders + others[:, None] * WIDTH + columns[None, :], mask=mask, other=0.0), axis=0)
             start += CHUNK
+        node = tl.load(receivers + stop - 1).to(tl.int64)
         tl.store(received + node * WIDTH + columns, total.to(received.dtype.element_ty), mask=present)
+
+
+@triton.jit
+def nodes_pass(
+    nodes,
+    received,
+    weight_1,
+    stride_1,
+    bias_1,
+    weight_2,
+    bias_2,
+    weight_3,
+    bias_3,
+    scale,
+    shift,
+    updated,
+    count,
+    eps,
+    PRECISION: tl.constexpr,
+    WIDEN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    TILE: tl.constexpr,
+    SETS: tl.constexpr,
+):
+    """New latents of TILE nodes from their own and the sums that they received from every edge set."""
+    rows = tl.program_id(0) * TILE + tl.arange(0, TILE)
+    columns = tl.arange(0, PADDED)
+    present = columns < WIDTH
+    both = (rows < count)[:, None] & present[None, :]
+    places = rows[:, None].to(tl.int64) * WIDTH + columns[None, :]
+    dtype = received.dtype.element_ty
+    node = tl.load(nodes + places, mask=both, other=0.0)
+    hidden = _layer(node.to(dtype), weight_1, stride_1, columns, present, PRECISION, WIDEN)
+    for place in tl.static_range(SETS):
+        sums = tl.load(received + place * count * WIDTH + places, mask=both, other=0.0)
+        hidden += _layer(sums, weight_1 + (place + 1) * WIDTH, stride_1, columns, present, PRECISION, WIDEN)
+    hidden += _vector(bias_1, columns, present)[None, :]
+    rest = (weight_2, bias_2, weight_3, bias_3, scale, shift)
+    out = _tail(hidden, *rest, columns, present, eps, dtype, PRECISION, WIDEN, WIDTH)
+    tl.store(updated + places, node + out.to(node.dtype), mask=both)
+
+
+@triton.jit
+def tail_pass(
+    hidden,
+    residual,
+    weight_2,
+    bias_2,
+    weight_3,
+    bias_3,
+    scale,
+    shift,
+    out,
+    count,
+    eps,
+    PRECISION: tl.constexpr,
+    WIDEN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PADDED: tl.constexpr,
+    TILE: tl.constexpr,
+    ADD: tl.constexpr,
+):
+    """A network behind its first layer for TILE rows; plus ``residual`` with ADD."""
+    rows = tl.program_id(0) * TILE + tl.arange(0, TILE)
+    columns = tl.arange(0, PADDED)
+    present = columns < WIDTH
+    both = (rows < count)[:, None] & present[None, :]
+    places = rows[:, None].to(tl.int64) * WIDTH + columns[None, :]
+    first = tl.load(hidden + places, mask=both, other=0.0)
+    rest = (weight_2, bias_2, weight_3, bias_3, scale, shift)
+    result = _tail(first.to(tl.float32), *rest, columns, present, eps, hidden.dtype.element_ty, PRECISION, WIDEN, WIDTH)
+    if ADD:
+        result += tl.load(residual + places, mask=both, other=0.0).to(tl.float32)
+    tl.store(out + places, result.to(out.dtype.element_ty), mask=both)

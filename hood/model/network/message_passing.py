@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from hood.model.graph.builder import EdgeSet, Subset
-from hood.model.kernels import block, triton_edge
+from hood.model.kernels import block, triton_step
 from hood.model.network.mlp import MLP, Kept, Layers
 from hood.tensors.dense import affine_plus, blocks, gram, linear, pad_rows, relu_, sum_rows, wants_padding
 
@@ -53,7 +53,7 @@ def update_edges(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet, overwr
     """e' = e + m and Σ m at the receivers, m = MLP([v_receiver, v_sender, e]) with a layer norm at its output.
 
     The first layer is split by columns, W [v_r, v_s, e] = W_r v_r + W_s v_s + W_e e: its node parts are evaluated once
-    per node instead of once per edge. Without gradients a CUDA device with Triton takes :mod:`hood.model.kernels.triton_edge`.
+    per node instead of once per edge.
 
     Args:
         mlp: edge network, 3d → d.
@@ -71,9 +71,6 @@ def update_edges(mlp: MLP, nodes: Tensor, latent: Tensor, edges: EdgeSet, overwr
     table = linear(nodes, weight, torch.cat([mlp.first.bias, torch.zeros_like(mlp.first.bias)]))
     keep = torch.is_grad_enabled()
     overwrite = overwrite and not keep
-    if triton_edge.applies(latent):
-        precision = triton_edge.input_precision()
-        return triton_edge.update_edges_fused(mlp, table, latent, edges, overwrite, precision)
     parameters = mlp.tail_parameters()
     if mlp.compiled and block.applies(latent, parameters):
         setting = block.Setting(keep, mlp.norm.eps, edges, overwrite)
@@ -164,8 +161,11 @@ class ProcessorStep(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part.
 
-        With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for.
+        With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. Without gradients
+        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`.
         """
+        if self._is_own() and triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device):
+            return triton_step.take(self, nodes, edges, subsets, overwrite, triton_step.input_precision())
         # The node network's first layer by columns: aggregates exist only at the nodes that have an edge in the set.
         first = self.node_mlp.first
         own, *parts = first.weight.split(self.latent_dim, dim=1)
@@ -179,6 +179,15 @@ class ProcessorStep(nn.Module):
             received, rows = linear(received, weight), subset.edges.nodes.shape[0]
             hidden.index_add_(0, subset.edges.nodes, received if len(received) == rows else received[:rows])
         return self.node_mlp.tail(hidden, nodes), updated
+
+    def _is_own(self) -> bool:
+        """Whether it is the function of hood's own classes."""
+        parts = (self.node_mlp, *self.edge_mlps.values())
+        return (
+            type(self) is ProcessorStep
+            and self.aggregation == "sum"
+            and all(type(part) is MLP and part.norm is not None for part in parts)
+        )
 
     def _update_set(self, name: str, nodes: Tensor, latent: Tensor, subset: Subset, overwrite: bool) -> tuple[Tensor, Tensor]:
         """New latents of a set, and the aggregate at the nodes that have an edge in it (and in rows of no meaning)."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from hood.model.kernels import block
+from hood.model.kernels import block, triton_step
 from hood.tensors.dense import affine, blocks, gram, linear
 
 
@@ -48,6 +48,8 @@ class MLP(nn.Module):
         keep, parameters = torch.is_grad_enabled(), self.tail_parameters()
         if self.compiled and block.applies(hidden, parameters):
             return block.tail_compiled(hidden, residual, block.Setting(keep, self.norm.eps), *parameters)
+        if type(self) is MLP and triton_step.applies(hidden.shape[1], hidden.dtype, hidden.device):
+            return triton_step.mlp_tail(hidden, residual, list(parameters), self.norm.eps, triton_step.input_precision())
         result: Tensor = _Tail.apply(hidden, residual, keep, self.norm.eps, *parameters)
         return result
 

@@ -19,6 +19,7 @@ from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.linear import invert_blocks
 from hood.solver.vertex.cg_step import STEPS, PositiveMatrix, global_step
 from hood.tensors.conjugate_gradients import Steps
+from hood.tensors.dense import add_rows
 from hood.tensors.weak_cache import forget
 
 #: Upper triangle of a 3 × 3 block.
@@ -61,11 +62,9 @@ class LocalTerms:
         springs = terms.attachments(pos)
         if springs is not None:
             ends = self.problem.step.attachments.edges.t().reshape(-1)  # type: ignore[union-attr]
-            gradient = gradient.index_add(0, ends, springs[0].permute(0, 2, 1).reshape(-1, 3))
+            gradient = add_rows(gradient, ends, springs[0].permute(0, 2, 1).reshape(-1, 3))
             stiffness = terms.spring_stiffness().repeat(2)
-            matrix = matrix.index_add(
-                0, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-            )
+            matrix = add_rows(matrix, ends, stiffness[:, None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device))
         models = [points.model(pos) for points in terms.points]
         for points, model in zip(terms.points, models, strict=True):
             gradient = gradient + points.spread(model.gradient, gradient)

@@ -19,6 +19,7 @@ from hood.solver.derivatives.elements import FaceModel
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.linear import invert_blocks
 from hood.tensors.conjugate_gradients import Scenes, Steps, solve
+from hood.tensors.dense import add_rows
 
 #: Half as many as there are vertices along a square sheet: from its middle to its rim.
 STEPS = Steps(0.5, 8)
@@ -97,7 +98,7 @@ def _springs(terms: StepTerms) -> Callable[[Tensor, Tensor], Tensor] | None:
 
     def add(product: Tensor, x: Tensor) -> Tensor:
         pull = stiffness * (x[start] - x[end])
-        return product.index_add(0, start, pull).index_add(0, end, -pull)
+        return add_rows(add_rows(product, start, pull), end, -pull)
 
     return add
 

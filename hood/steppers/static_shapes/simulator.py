@@ -23,7 +23,6 @@ from hood.mesh.closest_point.search import Incidence
 from hood.mesh.closest_point.vertices import Nearest
 from hood.model.features.inputs import EdgeRows, Inputs
 from hood.model.graph.static_shapes import Capacity, StaticLayout, build_fixed_graph, capacity_for, lay_out
-from hood.model.kernels import triton_edge
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import incidence_of
 from hood.steppers.network import NetworkStepper, Prediction, Prepared
@@ -275,7 +274,7 @@ class _Plan:
         memory = self._inputs.tensors
         settled = None if potential is None else settled_potential(potential, problem)
         run: Run = FixedStep(simulator, self.layout, problem, dense=mode == "compiled", potential=settled)
-        if mode == "compiled" or (mode == "captured" and not _has_fused_edges(simulator, memory[0])):
+        if mode != "fixed":
             run = trace(run, memory)
         if mode == "compiled":
             run = torch.compile(run, fullgraph=True, dynamic=False)
@@ -300,12 +299,6 @@ class _Plan:
 
     def _read(self, problem: StepProblem) -> list[Tensor]:
         return step_inputs(problem, self._simulator.needs_contact)
-
-
-def _has_fused_edges(simulator: NetworkStepper, like: Tensor) -> bool:
-    """Whether edges are updated by kernels of our own, which a graph can hold and a trace cannot look into."""
-    precision = torch.bfloat16 if simulator.network.precision == "bf16" else like.dtype
-    return triton_edge.applies(like.new_empty(1, simulator.config["latent_dim"], dtype=precision))
 
 
 def _limits(problem: StepProblem) -> tuple[int, int, int]:
