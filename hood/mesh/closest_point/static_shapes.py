@@ -23,7 +23,7 @@ from hood.mesh.closest_point.search import (
     weights_and_offset,
 )
 from hood.tensors.batch import gather_true
-from hood.tensors.dense import sum_scenes
+from hood.tensors.dense import is_whole, sum_scenes
 
 
 @torch.no_grad()
@@ -79,7 +79,7 @@ def _nearest(
     query = torch.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
     count = min(NUM_NEAREST, len(vertices))
     index, dist = [], []
-    rows = max(1, CHUNK_PAIRS // len(vertices))
+    rows = max(1, _pairs_at_once(query) // len(vertices))
     for chunk, scene in zip(query.split(rows), point_scene.split(rows), strict=True):
         pairs = torch.cdist(chunk, vertices, compute_mode="donot_use_mm_for_euclid_dist")
         pairs = pairs.masked_fill_(~usable | (scene.unsqueeze(1) != vertex_scene), torch.inf)
@@ -90,6 +90,11 @@ def _nearest(
     vertex = torch.where(torch.isinf(away), vertex[:, :1], vertex)
     places = [min(place, count - 1) for place in range(NUM_NEAREST)]
     return torch.stack([vertex[:, i] for i in places], dim=1), torch.stack([away[:, i] for i in places], dim=1)
+
+
+def _pairs_at_once(points: Tensor) -> int:
+    """How many distances are in memory together: 16 MB of them in the cache of a CPU, 256 MB and few kernels on a GPU."""
+    return CHUNK_PAIRS if points.device.type == "cpu" and not is_whole() else 16 * CHUNK_PAIRS
 
 
 def _exhaustive(
@@ -118,7 +123,7 @@ def _closest_of(
     fan = span([y - x for x, y in zip(a, b, strict=True)], [y - x for x, y in zip(a, c, strict=True)])
     scene = torch.where(there, face_scene[candidates], -1)
     closest, found = [], []
-    rows = max(1, CHUNK_PAIRS // (8 * len(candidates)))
+    rows = max(1, _pairs_at_once(points) // (8 * len(candidates)))
     for chunk, of_points in zip(points.split(rows), point_scene.split(rows), strict=True):
         p = [chunk[:, i : i + 1] - a[i] for i in range(3)]
         best, place = gain(p, fan).masked_fill(of_points.unsqueeze(1) != scene, -torch.inf).max(dim=1)

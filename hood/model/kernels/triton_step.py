@@ -31,11 +31,9 @@ if TYPE_CHECKING:
     from hood.model.network.message_passing import ProcessorStep
     from hood.model.network.mlp import MLP
 
-#: Rows of a tile: rows of the products, and the length of the sums within a tile. With twice as many the compiler runs out of
-#: registers.
-TILES = {torch.float32: 32, torch.bfloat16: 64}
-#: Widest latent whose weights fit on the chip next to a tile.
-MAX_WIDTH = 128
+#: Widest latents by precision. The weights of float32 beyond it leave a program no registers: at 128 each of its threads would
+#: keep 16 to 28 KB in memory (tests/model/kernels/test_triton_compiled.py has the limit).
+WIDEST = {torch.float32: 64, torch.bfloat16: 128}
 #: How float32 is multiplied: as it is; on tensor cores as three products of parts of 10 bits, which is as good; or rounded to
 #: 10 bits.
 INPUT_PRECISIONS = ("ieee", "tf32x3", "tf32")
@@ -57,11 +55,11 @@ def assumed() -> Iterator[None]:
 
 def applies(width: int, dtype: torch.dtype, device: torch.device) -> bool:
     """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, without gradients, float32 or
-    bfloat16, a multiple of 16 up to :data:`MAX_WIDTH`, where Triton is installed. ``HOOD_TRITON=off`` in the environment turns
+    bfloat16, a multiple of 16 up to :data:`WIDEST`, where Triton is installed. ``HOOD_TRITON=off`` in the environment turns
     it off."""
     if torch.is_grad_enabled() or not (_assumed or (device.type == "cuda" and _supported(device))):
         return False
-    return width % 16 == 0 and width <= MAX_WIDTH and dtype in TILES and os.environ.get("HOOD_TRITON", "on") != "off"
+    return width % 16 == 0 and width <= WIDEST.get(dtype, 0) and os.environ.get("HOOD_TRITON", "on") != "off"
 
 
 @cache
@@ -153,12 +151,12 @@ def step_edges(
         rows: (N,) rows of ``latent`` that take part; None: all of them.
         parameters: the first layer's part for an edge (a view of d columns), then ``tail_parameters``.
     """
-    count, width, tile = receivers.shape[0], latent.shape[1], TILES[latent.dtype]
+    count, width = receivers.shape[0], latent.shape[1]
+    tile, options = tile_of(width, latent.dtype), options_of(width, latent, precision)
     tiles = -(-count // tile)
     borders = torch.empty(2, tiles, width, dtype=torch.float32, device=latent.device)
     first, *tail = parameters
     shape: dict[str, Any] = {"WIDTH": width, "PADDED": _power_of_two(width), "TILE": tile}
-    options = {"PRECISION": precision, "WIDEN": latent.device.type == "cpu", "num_warps": 8, "num_stages": 1}
     where = (tables, tables.stride(0), column, receivers, senders, local_receivers, rows if rows is not None else receivers)
     edges_pass, border_pass = _kernels().edges_pass, _kernels().border_pass
     arguments = (latent, *where, first, first.stride(0), *tail, received, borders, count, tiles, eps)
@@ -170,9 +168,9 @@ def step_edges(
 @torch.library.custom_op("hood::step_nodes", mutates_args=())
 def step_nodes(nodes: Tensor, received: Tensor, parameters: Sequence[Tensor], eps: float, precision: str) -> Tensor:
     """v + MLP([v, Σ_s1, Σ_s2, …]) of all nodes (R, d); ``received`` (S, R, d) has the sums in the order of the columns."""
-    (count, width), tile, updated = nodes.shape, TILES[received.dtype], torch.empty_like(nodes)
+    (count, width), updated = nodes.shape, torch.empty_like(nodes)
+    tile, options = tile_of(width, received.dtype), options_of(width, received, precision)
     shape: dict[str, Any] = {"WIDTH": width, "PADDED": _power_of_two(width), "TILE": tile, "SETS": received.shape[0]}
-    options = {"PRECISION": precision, "WIDEN": nodes.device.type == "cpu", "num_warps": 8, "num_stages": 1}
     first, *others = parameters
     _kernels().nodes_pass[(-(-count // tile),)](
         nodes, received, first, first.stride(0), *others, updated, count, eps, **options, **shape
@@ -194,12 +192,12 @@ def _(*arguments: Any) -> None:
 def mlp_tail(hidden: Tensor, residual: Tensor | None, parameters: Sequence[Tensor], eps: float, precision: str) -> Tensor:
     """A network behind its first layer, ``hidden`` (N, d) before the ReLU, with ``tail_parameters``; plus ``residual`` (N, d),
     in whose precision it then comes."""
-    (count, width), tile = hidden.shape, TILES[hidden.dtype]
+    count, width = hidden.shape
+    tile, options = tile_of(width, hidden.dtype), options_of(width, hidden, precision)
     out = torch.empty_like(hidden if residual is None else residual)
     if count == 0:
         return out
     shape: dict[str, Any] = {"WIDTH": width, "PADDED": _power_of_two(width), "TILE": tile, "ADD": residual is not None}
-    options = {"PRECISION": precision, "WIDEN": hidden.device.type == "cpu", "num_warps": 8, "num_stages": 1}
     hidden, added = hidden.contiguous(), hidden if residual is None else residual.contiguous()
     _kernels().tail_pass[(-(-count // tile),)](hidden, added, *parameters, out, count, eps, **options, **shape)
     return out
@@ -208,6 +206,17 @@ def mlp_tail(hidden: Tensor, residual: Tensor | None, parameters: Sequence[Tenso
 @mlp_tail.register_fake
 def _(hidden: Tensor, residual: Tensor | None, parameters: Sequence[Tensor], eps: float, precision: str) -> Tensor:
     return torch.empty_like(hidden if residual is None else residual)
+
+
+def tile_of(width: int, dtype: torch.dtype) -> int:
+    """Rows of a tile: of the products, and of the sums within a tile. With twice as many the registers do not suffice."""
+    return 16 if dtype == torch.float32 or width > 64 else 32
+
+
+def options_of(width: int, like: Tensor, precision: str) -> dict[str, Any]:
+    """How the kernels are compiled for latents such as ``like``."""
+    warps = 8 if width <= 64 else 16
+    return {"PRECISION": precision, "WIDEN": like.device.type == "cpu", "num_warps": warps, "num_stages": 1}
 
 
 def _power_of_two(width: int) -> int:
