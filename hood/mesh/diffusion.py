@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.native import features
-from hood.tensors.dense import sum_of_rows
+from hood.tensors.dense import RowSums
 from hood.tensors.weak_cache import forget
 
 
@@ -22,8 +22,9 @@ class Diffusion:
 
     def __init__(self, edges: Tensor, num_vertices: int) -> None:
         start, end = edges.unbind(dim=1)
-        self._senders, self._receivers = torch.cat([start, end]), torch.cat([end, start])
-        degree = self._receivers.new_zeros(num_vertices).index_add(0, self._receivers, torch.ones_like(self._receivers))
+        senders, receivers = torch.cat([start, end]), torch.cat([end, start])
+        degree = receivers.new_zeros(num_vertices).index_add(0, receivers, torch.ones_like(receivers))
+        self._sum = RowSums(receivers, senders, num_vertices)
         self._half = (0.5 / degree.clamp_min(1)).unsqueeze(1)
 
     def spread(self, values: Tensor, rounds: int) -> Tensor:
@@ -32,9 +33,6 @@ class Diffusion:
         for _ in range(rounds):
             values = 0.5 * values + self._sum(half * values)
         return values
-
-    def _sum(self, values: Tensor) -> Tensor:
-        return sum_of_rows(values, self._receivers, self._senders, len(values))
 
 
 class _Neighbours(NamedTuple):

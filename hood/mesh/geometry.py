@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hood.tensors.dense import add_rows, sum_of_rows
+from hood.tensors.dense import RowSums, add_rows
 
 if TYPE_CHECKING:
     from hood.mesh.closest_point.search import Incidence
@@ -40,7 +40,7 @@ def vertex_normals(pos: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals (V, 3); zero where undefined (isolated vertex, cancelling faces)."""
     cross = _cross(pos, faces)
     rows = torch.arange(len(faces), device=faces.device).repeat(3)
-    return _unit(sum_of_rows(cross, faces.t().reshape(-1), rows, len(pos)))
+    return _unit(RowSums(faces.t().reshape(-1), rows, len(pos))(cross))
 
 
 def normals_of_fans(pos: Tensor, faces: Tensor, around: Tensor, first: Tensor, rows: Tensor | None = None) -> Tensor:

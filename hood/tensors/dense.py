@@ -103,18 +103,38 @@ def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
     """
     if target.device.type == "cpu" and not _whole:
         return target.index_add(0, index, rows)
-    order = index.argsort(stable=True)
-    offsets = torch.searchsorted(index[order], torch.arange(len(target) + 1, device=index.device))
+    order, offsets = _by_index(index, len(target))
     width = math.prod(target.shape[1:])
     return target + sum_rows(rows.reshape(len(rows), width), order, offsets).reshape(target.shape)
 
 
-def sum_of_rows(values: Tensor, index: Tensor, chosen: Tensor, count: int) -> Tensor:
-    """Σ ``values[chosen]`` at ``index``, (count, C) for ``values`` (M, C) and both (N,), in the order of the list."""
-    if values.device.type == "cpu" and not _whole:
-        return values.new_zeros(count, values.shape[1]).index_add(0, index, values.index_select(0, chosen))
+class RowSums:
+    """Σ ``values[chosen]`` at ``index``, (count, C) for ``values`` (M, C), in the order of the list.
+
+    For sums that are taken again and again: the order in which a GPU adds is found once.
+
+    Args:
+        index: (N,) 0 … count − 1.
+        chosen: (N,) rows of the values.
+    """
+
+    def __init__(self, index: Tensor, chosen: Tensor, count: int) -> None:
+        self._index, self._chosen, self._count = index, chosen, count
+        self._offsets: Tensor | None = None
+        if index.device.type != "cpu" or _whole:
+            order, self._offsets = _by_index(index, count)
+            self._chosen = chosen[order]
+
+    def __call__(self, values: Tensor) -> Tensor:
+        if self._offsets is not None:
+            return sum_rows(values, self._chosen, self._offsets)
+        return values.new_zeros(self._count, values.shape[1]).index_add(0, self._index, values.index_select(0, self._chosen))
+
+
+def _by_index(index: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rows (N,) sorted by ``index`` (N,), those of one value as they were; where each of 0 … ``count`` begins, (count + 1,)."""
     order = index.argsort(stable=True)
-    return sum_rows(values, chosen[order], torch.searchsorted(index[order], torch.arange(count + 1, device=index.device)))
+    return order, torch.searchsorted(index[order], torch.arange(count + 1, device=index.device))
 
 
 def sum_scenes(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:

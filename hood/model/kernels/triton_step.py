@@ -92,6 +92,9 @@ def take(
         subsets: which rows of a set take part.
         overwrite: write new latents over the old ones.
         precision: of products of float32, one of :data:`INPUT_PRECISIONS`.
+
+    Raises:
+        ValueError: another precision.
     """
     if precision not in INPUT_PRECISIONS:
         raise ValueError(f"precision is {precision!r}; choose {' or '.join(INPUT_PRECISIONS)}")

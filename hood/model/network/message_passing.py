@@ -164,7 +164,7 @@ class ProcessorStep(nn.Module):
         With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. Without gradients
         a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`.
         """
-        if self._is_own() and triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device):
+        if triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device) and self._is_own():
             return triton_step.take(self, nodes, edges, subsets, overwrite, triton_step.input_precision())
         # The node network's first layer by columns: aggregates exist only at the nodes that have an edge in the set.
         first = self.node_mlp.first

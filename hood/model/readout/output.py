@@ -28,7 +28,7 @@ from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass,
 from hood.native import features as native
 from hood.solver.vertex.cg_step import STEPS
 from hood.tensors.conjugate_gradients import Steps
-from hood.tensors.dense import sum_of_rows
+from hood.tensors.dense import RowSums
 
 _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
@@ -250,9 +250,9 @@ def _smooth(values: Tensor, trust: Tensor, edges: Tensor) -> Tensor:
     weight = trust.unsqueeze(1)
     total = torch.cat([values * weight, weight], dim=1)
     degree = torch.zeros_like(weight).index_add(0, receivers, torch.ones_like(weight[senders])).clamp_min(1.0)
-    smooth = total
+    smooth, sums = total, RowSums(receivers, senders, len(total))
     for _ in range(_SMOOTHING_ROUNDS):
-        spread = sum_of_rows(smooth, receivers, senders, len(smooth)) / degree
+        spread = sums(smooth) / degree
         # A vertex keeps its own say in every round, in proportion to its trust.
         smooth = weight * total + (1.0 - 0.5 * weight) * spread
     return smooth[:, :3] / smooth[:, 3:].clamp_min(1e-12)
