@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from hood.tensors.dense import RowSums, add_rows
+from hood.tensors.dense import add_rows
 
 if TYPE_CHECKING:
     from hood.mesh.closest_point.search import Incidence
@@ -39,8 +39,7 @@ def face_normals(pos: Tensor, faces: Tensor) -> Tensor:
 def vertex_normals(pos: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals (V, 3); zero where undefined (isolated vertex, cancelling faces)."""
     cross = _cross(pos, faces)
-    rows = torch.arange(len(faces), device=faces.device).repeat(3)
-    return _unit(RowSums(faces.t().reshape(-1), rows, len(pos))(cross))
+    return _unit(add_rows(torch.zeros_like(pos), faces.t().reshape(-1), cross.repeat(3, 1)))
 
 
 def normals_of_fans(pos: Tensor, faces: Tensor, around: Tensor, first: Tensor, rows: Tensor | None = None) -> Tensor:
