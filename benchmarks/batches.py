@@ -94,7 +94,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--garments", nargs="+", default=["dress", "tshirt"])
     parser.add_argument("--counts", nargs="+", type=int, default=[1, 8, 16])
-    parser.add_argument("--models", nargs="+", default=["quickstart", "ours"], help="shipped names or model files")
+    parser.add_argument("--models", nargs="+", default=["quickstart", "small-ours"], help="shipped names or model files")
     parser.add_argument("--kernels", default="fused")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=7)

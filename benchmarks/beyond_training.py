@@ -1,7 +1,7 @@
 """A network where it was not trained: on a finer mesh, at rest for long, and under ten times the gravity, beside the solver.
 
     python benchmarks/beyond_training.py edges              # a name that ships, or model.safetensors of a run
-    python benchmarks/beyond_training.py edges ours --parts mesh gravity
+    python benchmarks/beyond_training.py edges small-ours --parts mesh gravity
 
 - ``mesh``: the dress of 12,000 vertices in walk_proud, strain at frame 10. A network that does not let the long waves go leaves
   such a dress hanging in the air, with too little strain.

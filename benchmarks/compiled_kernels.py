@@ -1,6 +1,6 @@
 """The kernels of a frame that torch.compile makes, counted without a GPU: of ``step=compiled`` with the Triton kernels in it.
 
-    python benchmarks/compiled_kernels.py ours 1000          # a model by name, vertices of the dress
+    python benchmarks/compiled_kernels.py small-ours 1000          # a model by name, vertices of the dress
     python benchmarks/compiled_kernels.py quickstart 1000
 
 The compiler's scheduler decides on a CPU what is one kernel, and nothing is generated or run. A GPU's scheduler decides alike,
@@ -20,11 +20,11 @@ from gpu import Bench
 
 from hood.assets.files.library import locate
 from hood.model.graph.static_shapes import lay_out
-from hood.model.kernels import triton_step
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.static_shapes.cuda_graph import count_operations, trace
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
+from hood.tensors.triton_device import assumed
 
 #: Kernels of an operator that has not one.
 KERNELS = {"torch.ops.hood.step_edges.default": 2}
@@ -72,7 +72,7 @@ def main(model: str, size: int) -> None:
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
     layout = lay_out(static, CapturedSimulator(simulator, "fixed")._first_capacity(problem))
     inputs = step_inputs(problem, simulator.needs_contact)
-    with triton_step.assumed():
+    with assumed():
         module = trace(FixedStep(simulator, layout, problem, dense=True, potential=potential), inputs)
         kernels = schedule(module, inputs)
     print(f"{model}, {size:,} vertices: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels")

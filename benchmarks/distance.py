@@ -1,7 +1,7 @@
 """How far a network's rollout is from the solver's after some frames, of all embedded garments and held-out motions.
 
     python benchmarks/distance.py                                    # quickstart, 1,000 vertices, 30 frames
-    python benchmarks/distance.py ours --garments dress --frames 60
+    python benchmarks/distance.py small-ours --garments dress --frames 60
 
 Both begin at the same rest and know no contact of cloth with cloth. Printed are distances of vertices at the last frame: the
 root of the mean square over a garment's vertices, and the farthest one, in millimetres; and beside them how far cloth moves in

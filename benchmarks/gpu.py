@@ -442,7 +442,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=9.0)
     parser.add_argument("--sizes", type=int, nargs="+", default=[4400, 1000, 12000, 50000])
-    parser.add_argument("--models", nargs="+", default=["quickstart", "ours", "fine15"], help="names of embedded weights")
+    parser.add_argument("--models", nargs="+", default=["quickstart", "small-ours", "small-fine15"], help="embedded weights")
     parser.add_argument("--device-specs", choices=sorted(DATA_SHEETS), default="h100", help="computed for it without a GPU")
     parser.add_argument("--csv", type=Path, default=None)
     args = parser.parse_args()

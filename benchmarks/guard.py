@@ -1,7 +1,7 @@
 """What a guard looks at in rollouts of nominal cloth, and how often it would speak: where its limits come from.
 
     python benchmarks/guard.py                    # quickstart, quickstart+5 and newton on the validation list
-    python benchmarks/guard.py --steppers ours --garments dress tshirt --motions walk_proud --frames 30
+    python benchmarks/guard.py --steppers small-ours --garments dress tshirt --motions walk_proud --frames 30
     python benchmarks/guard.py --cost             # also its time: rollouts with and without it, by turns
     python benchmarks/guard.py --mode repair      # with guard=repair, which also looks for triangles in the skin
 

@@ -36,7 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garment", nargs="?", default="dress_4k")
     parser.add_argument("sequence", nargs="?", default="walk_proud")
-    parser.add_argument("--checkpoint", default="ours")
+    parser.add_argument("--checkpoint", default="small-ours")
     arguments = parser.parse_args()
     potential, sample = default_potential(), StepSample(range(3, FRAMES), STATES)
     scene = build_scene(load_garment(arguments.garment), load_body(), load_sequence(arguments.sequence))

@@ -28,6 +28,7 @@ import numpy as np
 from scipy.stats import t
 
 from hood.evaluation.bootstrap import LEVEL, Estimate, pooled_interval
+from hood.evaluation.table import ALL
 from hood.media.bars import write_png
 
 #: By resolution: garments, and frames of a rollout.
@@ -65,6 +66,10 @@ class Point:
     gap_p95: Estimate
     strain_p99: float
     rg: float
+    worn: float  # share of the frames
+    L_total: float  # [J]
+    gradient_norm: float  # [N]
+    sound: float  # share of the rollouts
     states: int
 
 
@@ -118,6 +123,8 @@ def _point(folder: Path) -> Point:
     measured = [line["measured"] for line in lines if "measured" in line]
     groups = [[gap["gamma"] for gap in one["gaps"]] for one in measured]
     frames = [frame for one in measured for frame in one["frames"]]
+    rows = json.loads((folder / "table.json").read_text())
+    means = next((row for row in rows if row["garment"] == ALL), rows[-1])
     return Point(
         run=note["run"],
         updates=note["updates"],
@@ -127,6 +134,7 @@ def _point(folder: Path) -> Point:
         gap_p95=_estimate(groups, partial(np.quantile, q=0.95)),
         strain_p99=_median(frames, "strain_p99"),
         rg=_median(frames, "relative_gradient"),
+        **{key: float(means[key]) for key in ("worn", "L_total", "gradient_norm", "sound")},
         states=sum(map(len, groups)),
     )
 
@@ -161,10 +169,13 @@ def fit(updates: Sequence[int], gaps: Sequence[float], until: int) -> Line:
 
 def table(points: Sequence[Point]) -> str:
     """A line per run and mark."""
-    lines = ["| run | updates | CPU s | vertices | γ median | γ 95th | strain p99 | rg | states |", "|" + 9 * "---|"]
+    titles = ("run", "updates", "CPU s", "vertices", "γ median", "γ 95th", "L_total [J]", "gradient norm [N]")
+    titles += ("worn", "sound", "strain p99", "rg", "states")
+    lines = [f"| {' | '.join(titles)} |", "|" + len(titles) * "---|"]
     for point in points:
         seconds = f"{point.cpu_s:,.0f}" if math.isfinite(point.cpu_s) else ""
         figures = [point.run, f"{point.updates:,}", seconds, point.size, _text(point.gap), _text(point.gap_p95)]
+        figures += [f"{point.L_total:.3g}", f"{point.gradient_norm:.2g}", f"{point.worn:.0%}", f"{point.sound:.0%}"]
         lines.append("| " + " | ".join([*figures, f"{point.strain_p99:.1%}", f"{point.rg:.2g}", str(point.states)]) + " |")
     return "\n".join(lines)
 

@@ -181,7 +181,7 @@ def print_table(name: str, measured: dict[str, Measured]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", choices=tuple(SCENES), default=[name for name in SCENES if name not in LARGE])
-    parser.add_argument("--models", nargs="+", default=["quickstart", "ours"], help="shipped names or model files")
+    parser.add_argument("--models", nargs="+", default=["quickstart", "small-ours"], help="shipped names or model files")
     parser.add_argument("--states", type=int, default=16, help="of every scene")
     parser.add_argument("--kernels", default="fused")
     parser.add_argument("--csv", type=Path, help="every solve")

@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 
 from hood.assets.files.guarded import guarded, listed, own_group
-from hood.assets.files.library import names, nearest, require_readable
+from hood.assets.files.library import RENAMED, names, nearest, require_readable
 from hood.assets.formats.gltf import read_gltf
 from hood.assets.formats.mesh_file import mesh_suffixes, split_object
 from hood.assets.formats.vertex_files import CACHE_SUFFIX
@@ -42,7 +42,7 @@ def identify(name: str) -> str:
         ValueError: unreadable, or of a kind that nothing here reads; says what was found in it.
     """
     for folder, kind in _EMBEDDED.items():
-        if name in names(folder):
+        if name in names(folder) or name in RENAMED.get(folder, {}):
             return kind
     head, colon, _ = name.rpartition(":")
     path = Path(head).expanduser() if colon and head.lower().endswith(".pkl") else split_object(name)[0]

@@ -16,7 +16,7 @@ from hood.app.common import prepare_folder
 from hood.app.output.export import export
 from hood.app.settings.compose import ConfigError, load_config
 from hood.assets.files.library import locate
-from hood.steppers.checkpoint import load_simulator, read_header, save_simulator
+from hood.steppers.checkpoint import CAUTION, load_simulator, read_header, save_simulator
 from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 
@@ -35,6 +35,9 @@ def convert(overrides: Sequence[str]) -> int:
     config = load_config("convert", overrides)
     source, target = _paths(config)
     simulator, header = _read(source)
+    if config.caution is not None:
+        simulator.caution = " ".join(str(config.caution).split())
+        header.pop(CAUTION, None)
     prepare_folder(target.parent)
     save_simulator(target, simulator, header, half=bool(config.half))
     count = sum(parameter.numel() for parameter in simulator.parameters())
@@ -65,13 +68,13 @@ def _paths(config: DictConfig) -> tuple[Path, Path]:
     if config.checkpoint is None:
         raise ConfigError("checkpoint is not given: hood convert checkpoint=weights.pth output=weights.safetensors")
     source = locate("weights", str(config.checkpoint))
-    if source.suffix == _MODEL and not config.half:
+    if source.suffix == _MODEL and not config.half and config.caution is None:
         raise ConfigError(
             f"{source}: is a model file already; give published weights ({', '.join(SUFFIXES)}), "
-            "or half=true output=small.safetensors"
+            "or half=true output=small.safetensors, or a caution for its users"
         )
     if source.suffix == _MODEL and config.output is None:
-        raise ConfigError(f"output is not given: where the float16 copy of {source} goes, e.g. output=small.safetensors")
+        raise ConfigError(f"output is not given: where the copy of {source} goes, e.g. output=small.safetensors")
     target = source.with_suffix(_MODEL) if config.output is None else Path(str(config.output)).expanduser()
     if target.suffix != _MODEL:
         raise ConfigError(f"output={target}: model files end in {_MODEL}")

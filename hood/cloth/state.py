@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.tensors.batch import concatenate, indexes
+from hood.tensors.dense import is_whole
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class StepInput:
     time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
 
     def __post_init__(self) -> None:
-        on_host = self.dt.device.type == "cpu"  # values elsewhere are not read back: the host would wait in every step
+        on_host = self.dt.device.type == "cpu" and not is_whole()  # values elsewhere are not read back: the host would wait
         sound = [0.0 < dt < float("inf") for dt in self.dt.reshape(-1).tolist()] if on_host else []
         if self.dt.ndim != 1 or not all(sound):
             scene = sound.index(False) if False in sound else 0

@@ -23,7 +23,7 @@ class Published(NamedTuple):
     gradient_norm: tuple[float, float]  # [N]
 
 
-#: By the names that models trained here have.
+#: By the names of the schedules; models with them have the name as a word of theirs (``ours``, ``small-ours``).
 PAPER = {
     "fine15": Published("Fine15", 15, 15, (6.65, 13.1), (2.92, 1.68), (2.37e-2, 3.7e-2)),
     "fine48": Published("Fine48", 48, 48, (2.45, 4.99), (1.43, 1.04), (1.03e-2, 2.5e-2)),
@@ -117,19 +117,25 @@ def _paper_column(garment: str) -> int:
 
 
 def _by_model(rows: Sequence[Row], garment: str) -> dict[str, Row]:
-    """Trained or not, the rows of models the paper has too: by name, else the first network that is as in the paper."""
-    here = [row for row in rows if row["garment"] == garment]
-    named = {row["model"]: row for row in here if row["model"] in PAPER}
+    """Trained or not, the first rows of models the paper has too: networks as in the paper, then others by their name."""
+    here = sorted((row for row in rows if row["garment"] == garment), key=lambda row: row.get("as_in_paper") is False)
+    found: dict[str, Row] = {}
     for row in here:
         reach = (row.get("steps"), row.get("radius"))
-        title = next((name for name, one in PAPER.items() if (one.steps, one.radius) == reach), None)
-        if title is not None and row.get("as_in_paper") and not any(one is row for one in named.values()):
-            named.setdefault(title, row)
-    return {name: named[name] for name in PAPER if name in named}
+        same = next((name for name, one in PAPER.items() if row.get("as_in_paper") and (one.steps, one.radius) == reach), None)
+        name = _schedule(row) or same
+        if name is not None:
+            found.setdefault(name, row)
+    return {name: found[name] for name in PAPER if name in found}
+
+
+def _schedule(row: Row) -> str | None:
+    """The schedule of the paper that the model's name names, or none."""
+    return next((word for word in str(row["model"]).split("-") if word in PAPER), None)
 
 
 def _radius_check(rows: Sequence[Row]) -> Check:
-    here = {row["model"]: row["radius"] for row in rows if row["model"] in PAPER and row["radius"] is not None}
+    here = {_schedule(row): row["radius"] for row in reversed(rows) if row["radius"] is not None}
     known = [name for name in PAPER if name in here]
     paper = " / ".join(f"{one.radius} ({one.title})" for one in PAPER.values())
     if not known:
@@ -191,8 +197,8 @@ def _cell(row: Row, key: str) -> str:
     text = _number(value)
     if key == "model" and row["weights"] == _UNTRAINED:
         text += " (untrained)"
-    if key == "model" and value in PAPER and row.get("as_in_paper") is False:
-        text += " (schedule alone)"
+    if key == "model" and _schedule(row) is not None and row.get("as_in_paper") is False:
+        text += " (other network)"
     low, high = row.get(f"{key}_low"), row.get(f"{key}_high")
     return text if key not in INTERVALS or low is None else f"{text} ({_number(low)} to {_number(high)})"
 
@@ -211,7 +217,7 @@ def _legend() -> str:
         "in joules, the median over those states, whose own L_total is in the second table. worn is the share of the frames "
         "before a part of the garment has come off the body: cloth that falls lowers L_total, by 2 J for 0.2 kg and a "
         "metre, so compare it only between models that keep it on. Of a model "
-        "marked (schedule alone) the network is another one than the paper's. L_total and gradient norm are means, "
+        "marked (other network) latent size, features or output are not the paper's. L_total and gradient norm are means, "
         "ms, rg and strain p99 medians over frames. A rollout has failed at the first frame that is not finite or whose strain "
         f"p99 exceeds {FAILURE_STRAIN:.0%}; frames to failure is the median over rollouts (–: less than half failed). γ "
         "unconverged and γ disagree are the shares of the states whose reference minimum missed its accuracy, and of those "

@@ -21,10 +21,14 @@ from hood.steppers.ranges import Conditions
 
 _FORMAT = "hood-1"
 _RANGES = "ranges"
+#: A sentence that users of the weights are told; most files have none.
+CAUTION = "caution"
 #: What the model takes from plugins, and the package of each; models without any have no such entry.
 _PLUGINS = "plugins"
 #: Characters of a name that is told.
 _TOLD = 80
+#: Characters of a caution.
+_SENTENCE = 300
 
 
 def save_simulator(
@@ -46,6 +50,7 @@ def save_simulator(
     known = {} if simulator.trained_for is None else {_RANGES: simulator.trained_for.to_json()}
     needed = plugins_of(simulator.config)
     known |= {_PLUGINS: json.dumps(needed)} if needed else {}
+    known |= {CAUTION: simulator.caution} if simulator.caution else {}
     header = {"format": _FORMAT, "model": json.dumps(simulator.config), **known, **(metadata or {})}
     write_atomically(path, _in_order(save(tensors, header)))
 
@@ -120,8 +125,14 @@ def load_simulator(path: Path) -> NetworkStepper:
         raise ValueError(f"{path}: weights do not fit the model in the file, first at {sorted(wrong)[0]!r}; it is damaged")
     simulator = build_simulator(**settings)
     simulator.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
-    simulator.trained_for = trained_for
+    simulator.trained_for, simulator.caution = trained_for, _sentence(header.get(CAUTION, ""))
     return simulator.eval()
+
+
+def _sentence(text: str) -> str | None:
+    """A line that a terminal can be given, whatever the file says; None for nothing."""
+    shown = "".join(letter for letter in " ".join(text.split()) if letter.isprintable())
+    return shown[:_SENTENCE] or None
 
 
 def _settings(header: Mapping[str, str]) -> dict[str, Any]:

@@ -97,6 +97,7 @@ class NetworkStepper(nn.Module):
         self.config = config
         self.register_buffer("gravity", torch.tensor([0.0, -9.81, 0.0]), persistent=False)
         self.trained_for: Conditions | None = None  # None: unknown
+        self.caution: str | None = None  # sentence that users of the weights are told
         self._potential = default_potential()
         self._wants_feedback = features.needs("feedback")
         self._wants_residual = not self._wants_feedback and features.needs("residual")
@@ -298,7 +299,7 @@ class NetworkStepper(nn.Module):
         copy.network.use_precision(self.network.precision)
         copy.network.use_kernels(self.network.kernels)
         copy.use_potential(self._potential)
-        copy.trained_for = self.trained_for
+        copy.trained_for, copy.caution = self.trained_for, self.caution
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, potential: Potential, problem: StepProblem, base: Tensor) -> Tensor:

@@ -110,7 +110,7 @@ def test_an_evaluation_has_its_table(ran: Any) -> None:
 
 @pytest.mark.slow
 def test_the_benchmark_for_a_gpu_goes_through_its_jobs(ran: Any) -> None:
-    assert {"ours plain", "ours captured", "newton 5 plain", "newton 5 captured"} <= set(ran("benchmark")["ways"])
+    assert {"small-ours plain", "small-ours captured", "newton 5 plain", "newton 5 captured"} <= set(ran("benchmark")["ways"])
 
 
 @pytest.mark.slow

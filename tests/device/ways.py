@@ -33,7 +33,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "network": ("garment=tshirt", *NETWORK),
     "network fixed": ("garment=tshirt", *NETWORK, *PLAIN, "step=fixed"),
     "network captured": ("garment=tshirt", *NETWORK, *PLAIN, "step=captured"),
-    "paper's features": ("garment=tshirt", "checkpoint=ours", "refine=0", "settle=paper"),
+    "paper's features": ("garment=tshirt", "checkpoint=small-ours", "refine=0", "settle=paper"),
     "solver": ("garment=tshirt", *SOLVER),
     "solver captured": ("garment=tshirt", *SOLVER, *PLAIN, "step=captured"),
     "refined": ("garment=tshirt", "checkpoint=quickstart", "refine=2"),
@@ -148,7 +148,7 @@ def benchmark(folder: Path) -> dict[str, object]:
     vars(module).update(measured_device=lambda: module.DATA_SHEETS["h100"], count_launches=lambda call: (call(), 0)[1])
     os.environ.update({key: os.environ.get(key, value) for key, value in module.ENVIRONMENT.items()})  # or it starts anew
     folder.mkdir()
-    sys.argv = ["gpu.py", "--sizes", "1000", "--models", "ours", "--minutes", "8", "--csv", str(folder / "gpu.csv")]
+    sys.argv = ["gpu.py", "--sizes", "1000", "--models", "small-ours", "--minutes", "8", "--csv", str(folder / "gpu.csv")]
     module.main()
     rows = list(csv.DictReader((folder / "gpu.csv").read_text().splitlines()))
     return {"ways": sorted({f"{row['method']} {row['way']}" for row in rows})}

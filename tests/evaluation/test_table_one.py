@@ -101,12 +101,15 @@ def test_the_dress_has_the_papers_first_figures() -> None:
 def test_only_the_papers_networks_stand_for_it() -> None:
     small = {"as_in_paper": False, "network": "latent 48, features local, output local_steps"}
     papers = {"as_in_paper": True, "network": "latent 128, features paper, output acceleration"}
-    text = page([row("ours", **small), row("mine", **papers, steps=48, radius=48), row("newton")], ABOUT)
-    assert "| **ours (schedule alone)** | **all** |" in text
+    text = page([row("small-ours", **small), row("mine", **papers, steps=48, radius=48), row("newton")], ABOUT)
+    assert "| **small-ours (other network)** | **all** |" in text
     assert "| **mine** | **all** | **48** | **48** |" in text
     assert "- Networks: the paper's have latent 128" in text
-    assert "Here ours: latent 48, features local, output local_steps." in text
+    assert "Here small-ours: latent 48, features local, output local_steps." in text
     assert "- Networks" not in page([row("ours", **papers)], ABOUT)
+    text = page([row("small-ours", ms=7.0, **small), row("mine", ms=5.0, **papers, steps=15, radius=48)], ABOUT)
+    assert "| **mine** | **all** |" in text
+    assert "| **small-ours" not in text  # the one that is the paper's, whatever its place
 
 
 def test_the_page_says_what_was_measured_and_how() -> None:

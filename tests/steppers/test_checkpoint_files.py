@@ -108,6 +108,18 @@ def test_ranges_travel_with_the_weights(tmp_path: Path) -> None:
     assert load_simulator(tmp_path / "new.safetensors").trained_for == trained_for
 
 
+def test_a_caution_travels_with_the_weights_as_one_line(tmp_path: Path) -> None:
+    simulator, path = make("paper"), tmp_path / "m.safetensors"
+    save_simulator(path, simulator)
+    assert load_simulator(path).caution is None
+    simulator.caution = "no rollout of it\nis \x1b[31museful yet" + 400 * "!"
+    save_simulator(path, simulator.clone(), half=True)
+    caution = load_simulator(path).caution
+    assert caution is not None
+    assert caution.startswith("no rollout of it is [31museful yet!")
+    assert len(caution) == 300
+
+
 @pytest.mark.parametrize("half", [False, True])
 def test_ranges_are_recorded_without_touching_the_tensors(half: bool, tmp_path: Path) -> None:
     path, trained_for = tmp_path / "m.safetensors", Conditions({"fps": (24.0, 30.0)}, default_potential().settings)

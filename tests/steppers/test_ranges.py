@@ -159,7 +159,9 @@ def test_every_scene_of_a_training_is_inside_of_it(tank_scene: Scene, skirt_scen
     assert len(outside(trained, scene_conditions(garments["tshirt"], shirt, 1 / 30, default_potential()))) == 2
 
 
-@pytest.mark.parametrize("name", ["quickstart", "fine15", "ours", "fine48", "small1", "small2", "small3", "edges"])
+@pytest.mark.parametrize(
+    "name", ["quickstart", "small-fine15", "small-ours", "small-fine48", "small1", "small2", "small3", "edges"]
+)
 def test_the_shipped_files_say_what_they_were_trained_for(name: str, garments: dict[str, Garment]) -> None:
     trained = load_simulator(locate("weights", name)).trained_for
     assert trained is not None

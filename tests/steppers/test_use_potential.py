@@ -56,7 +56,7 @@ def test_a_rollout_moves_by_the_potential_it_is_measured_with(kind: str, tank_sc
 
 
 def test_the_shipped_networks_feel_friction(tank_scene: Scene) -> None:
-    simulator = load_simulator(locate("weights", "ours"))
+    simulator = load_simulator(locate("weights", "small-ours"))
     slippery, rough = (last_pos(simulator, tank_scene, potential) for potential in (SLIPPERY, ROUGH))
     assert float((slippery - rough).norm(dim=1).max()) > 1e-4
 

@@ -26,8 +26,8 @@ from hood.steppers.static_shapes.simulator import network_of
 
 
 def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: str) -> list[str]:
-    """Of a rollout: one sentence on values outside of what the network ``name`` was trained for, and one on a potential that
-    it does not look at. None where a solver takes the steps."""
+    """Of a rollout: the sentence that the weights of the network ``name`` bring along, one on values outside of what it was
+    trained for, and one on a potential that it does not look at. None where a solver takes the steps."""
     betas = scene.motion.betas if isinstance(scene.motion, BodyMotion) else None
     gravity = float(stepper.gravity.norm())
     asked = scene_conditions(scene.garment, scene.cloth, scene.dt, potential, betas, gravity, scene.sizes)
@@ -36,7 +36,8 @@ def scene_cautions(stepper: Stepper, scene: Scene, potential: Potential, name: s
         on_body = {"material.friction": (low * float(scene.friction_scale.min()), high * float(scene.friction_scale.max()))}
         asked = replace(asked, spans={**asked.spans, **on_body})
     way_out = "stepper=newton needs no weights" + ("" if _is_refined(stepper) else ", refine=10 corrects every step")
-    sentences = []
+    network = network_of(stepper)
+    sentences = [f"{name}: {network.caution}"] if network is not None and network.caution else []
     strange = strange_values(stepper, {scene.garment.name: asked})
     if strange:
         sentences.append(f"{name} was not trained for {strange}; the motion may be wrong: {way_out}")
@@ -50,6 +51,9 @@ def evaluation_cautions(steppers: Mapping[str, Stepper], asked: Mapping[str, Con
     """The same of an evaluation of ``steppers`` by name, each on garments by name; models of whom the same is said share it."""
     sentences: dict[str, list[str]] = {}
     for name, stepper in steppers.items():
+        network = network_of(stepper)
+        if network is not None and network.caution:
+            sentences.setdefault(network.caution, []).append(name)
         way_out = "newton (stepper=newton) needs no weights"
         way_out += "" if _is_refined(stepper) else ", NAME+10 (refine=10) corrects every step"
         strange = strange_values(stepper, asked)

@@ -9,6 +9,7 @@ import difflib
 import json
 import math
 import os
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -60,6 +61,8 @@ DATA_FOLDER = Path(__file__).resolve().parents[2] / "data"
 SIZE_LIMIT = 3 << 29
 _LABEL = {"body": "body", "garments": "garment", "motions": "sequence", "weights": "checkpoint"}
 _SUFFIX = {"body": ".npz", "garments": ".npz", "motions": ".npz", "weights": ".safetensors"}
+#: Former names, by kind: they still find what they found.
+RENAMED = {"weights": {name: f"small-{name}" for name in ("ours", "fine15", "fine48")}}
 
 
 def names(kind: str) -> list[str]:
@@ -84,6 +87,8 @@ def names(kind: str) -> list[str]:
 def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
     """File of an embedded asset, or the user's own file; with ``folders`` also the user's own folder.
 
+    A former name finds the same file under its name of today; a warning says so.
+
     Raises:
         FileNotFoundError: neither an embedded name nor an existing file; the message lists the nearest names.
         ValueError: a file of another program's format; names the way out.
@@ -92,6 +97,10 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
     embedded = DATA_FOLDER / kind / f"{name}{_SUFFIX[kind]}"
     if embedded.is_file():
         return embedded
+    today = RENAMED.get(kind, {}).get(str(name))
+    if today is not None:
+        warnings.warn(f"{_LABEL[kind]} {name} is called {today} now: a small model, not the paper's", stacklevel=2)
+        return locate(kind, today)
     path = Path(name).expanduser()
     if path.is_file() or (folders and path.is_dir()):
         require_readable(path, kind)

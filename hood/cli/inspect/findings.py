@@ -286,6 +286,7 @@ def inspect_checkpoint(name: str) -> Finding:
     simulator = load_stepper(path, 30.0)
     finding = Finding(name, "checkpoint")
     finding.facts = {
+        **({} if simulator.caution is None else {"caution": simulator.caution}),
         "parameters": sum(parameter.numel() for parameter in simulator.parameters()),
         "message-passing steps": len(simulator.schedule),
         **{

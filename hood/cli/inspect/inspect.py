@@ -180,8 +180,8 @@ def _inspect(known: Finding, beside: str, config: DictConfig) -> Finding:
     except (ValueError, OSError) as error:
         return findings.unreadable(known.file, known.kind, error)
     for sentence in said:
-        what, _, fix = sentence.rpartition("; ")
-        finding.problem(what or sentence, fix)
+        what, separator, fix = sentence.rpartition("; ")
+        finding.problem(what if separator else sentence, fix if separator else "")
     return finding
 
 

@@ -14,11 +14,8 @@ a compiled frame holds them like any other, and a CUDA graph records them.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -26,6 +23,7 @@ from torch import Tensor
 
 from hood.model.graph.builder import EdgeSet, Subset
 from hood.tensors.dense import linear
+from hood.tensors.triton_device import has_triton
 
 if TYPE_CHECKING:
     from hood.model.network.message_passing import ProcessorStep
@@ -38,35 +36,11 @@ WIDEST = {torch.float32: 64, torch.bfloat16: 128}
 #: 10 bits.
 INPUT_PRECISIONS = ("ieee", "tf32x3", "tf32")
 
-_assumed = False
-
-
-@contextmanager
-def assumed() -> Iterator[None]:
-    """Inside, the device counts as one that has these kernels: to count the kernels of a frame, and to run them by Triton's
-    interpreter, on a CPU."""
-    global _assumed
-    before, _assumed = _assumed, True
-    try:
-        yield
-    finally:
-        _assumed = before
-
 
 def applies(width: int, dtype: torch.dtype, device: torch.device) -> bool:
     """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, without gradients, float32 or
-    bfloat16, a multiple of 16 up to :data:`WIDEST`, where Triton is installed. ``HOOD_TRITON=off`` in the environment turns
-    it off."""
-    if torch.is_grad_enabled() or not (_assumed or (device.type == "cuda" and _supported(device))):
-        return False
-    return width % 16 == 0 and width <= WIDEST.get(dtype, 0) and os.environ.get("HOOD_TRITON", "on") != "off"
-
-
-@cache
-def _supported(device: torch.device) -> bool:
-    """Whether Triton is here and the device an NVIDIA one with tensor cores for both precisions (Ampere or later)."""
-    here = find_spec("triton") is not None and torch.version.hip is None
-    return here and torch.cuda.get_device_capability(device) >= (8, 0)
+    bfloat16, a multiple of 16 up to :data:`WIDEST`, where :func:`hood.tensors.triton_device.has_triton` says so."""
+    return not torch.is_grad_enabled() and width % 16 == 0 and width <= WIDEST.get(dtype, 0) and has_triton(device)
 
 
 def input_precision() -> str:

@@ -21,7 +21,7 @@ from hood.assets.files.library import locate, names
 from hood.cloth.cloth import Cloth
 from hood.model.graph.hierarchy import num_passed_over
 from hood.model.graph.schedule import edge_set_names, parse_schedule, radius
-from hood.steppers.checkpoint import read_header
+from hood.steppers.checkpoint import CAUTION, read_header
 from hood.steppers.static_shapes.simulator import network_of
 from hood.studies.plan.ablation import Begun, Effect
 from hood.studies.plan.choices import levels_of
@@ -76,10 +76,14 @@ def diameter(cloth: Cloth) -> int:
 
 
 def _shipped(edge: float) -> list[dict[str, Any]]:
-    """Name, radius in edges and number of coarse levels of every shipped network, on a mesh of this mean edge [m]."""
+    """Name, radius in edges and number of coarse levels of every shipped network that no one is warned of, on a mesh of this
+    mean edge [m]."""
     found = []
     for name in names("weights"):
-        model = json.loads(read_header(locate("weights", name))["model"])
+        header = read_header(locate("weights", name))
+        if CAUTION in header:
+            continue
+        model = json.loads(header["model"])
         schedule, passed_over = parse_schedule(str(model["schedule"])), num_passed_over(edge, model.get("coarse_edge"))
         found.append({"name": name, "radius": radius(schedule, passed_over), "levels": len(edge_set_names(schedule)) - 1})
     return sorted(found, key=lambda one: (one["radius"], one["name"]))

@@ -129,12 +129,12 @@ def _check_size(config: DictConfig, size: str) -> None:
 
 
 #: Where no models are given: those of them that are embedded.
-KNOWN = ("fine15", "fine48", "ours", "small1", "small2", "small3", "quickstart")
+KNOWN = ("small-fine15", "small-fine48", "small-ours", "small1", "small2", "small3", "quickstart")
 SIZES = ("1k", "4k", "12k")
 #: Measured on the largest garments where nothing else is said.
-_LARGEST = ("fine15", "ours")
+_LARGEST = ("small-fine15", "small-ours")
 #: Measured with all iterations at every size where nothing else is said.
-_REFINED_MODEL = "ours"
+_REFINED_MODEL = "small-ours"
 #: Settings that may change from one call to the next: they add points or leave some out, and change none.
 _FREE = ("models", "precisions", "refine_methods", "newton", "refined", "jobs", "turns", "measure", "output")
 _FREE_BY_SIZE = ("refine", "guess", "models", "precisions")

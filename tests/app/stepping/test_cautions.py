@@ -132,6 +132,22 @@ def test_such_a_networks_own_potential_is_the_one_it_was_trained_with(paper: Net
     assert sentence.startswith("losses.terms.friction.coefficient=0.5 (trained on 10) changes only what is measured")
 
 
+def test_what_the_weights_say_of_themselves_is_told_where_they_are_used(
+    tmp_path: Path, paper: NetworkStepper, tank_scene: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_simulator(tmp_path / "weak.safetensors", paper)
+    given = [f"checkpoint={tmp_path}/weak.safetensors", f"output={tmp_path}/told.safetensors"]
+    assert main(["convert", *given, "caution=no rollout is useful yet"]) == 0
+    weak = load_simulator(tmp_path / "told.safetensors")
+    assert scene_cautions(refined(weak), tank_scene, DEFAULT, "weak")[0] == "weak: no rollout is useful yet"
+    tank = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 30, DEFAULT)
+    told = evaluation_cautions({"weak": weak, "copy": weak.clone(), "old": paper}, {"tank": tank})
+    assert told == ["weak, copy: no rollout is useful yet"]
+    capsys.readouterr()
+    assert main(["inspect", f"{tmp_path}/told.safetensors"]) == 0
+    assert "  caution: no rollout is useful yet" in capsys.readouterr().out
+
+
 def test_an_evaluation_says_it_once(quickstart: NetworkStepper, paper: NetworkStepper, tank_scene: Scene) -> None:
     tank = scene_conditions(tank_scene.garment, tank_scene.cloth, 1 / 60, DEFAULT)
     fine = Conditions({**tank.spans, "vertices": (9e3, 9e3)}, tank.potential)
@@ -172,9 +188,9 @@ def test_a_rollout_warns_once_and_writes_it_down(
 
 
 def test_an_evaluation_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["models=[fine15]", "garments=[tank]", "num_frames=4", "gap_states=0", "fps=25", f"output={tmp_path}"]
+    arguments = ["models=[small-fine15]", "garments=[tank]", "num_frames=4", "gap_states=0", "fps=25", f"output={tmp_path}"]
     assert main(["evaluate", *arguments]) == 0
-    assert "hood: warning: fine15: not trained for fps=25 (trained on 30);" in capsys.readouterr().err
+    assert "hood: warning: small-fine15: not trained for fps=25 (trained on 30);" in capsys.readouterr().err
 
 
 def test_inspect_prints_the_ranges(tmp_path: Path, quickstart: NetworkStepper, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,8 @@ from hood.cli.main import main
 
 IDLE = [
     (
-        ["stepper=newton", "checkpoint=ours", "precision=bf16"],
-        "checkpoint=ours precision=bf16 has no effect: with stepper=newton",
+        ["stepper=newton", "checkpoint=small-ours", "precision=bf16"],
+        "checkpoint=small-ours precision=bf16 has no effect: with stepper=newton",
     ),
     (
         ["stepper=refine", "refine=2", "kernels=torch"],
@@ -38,7 +38,7 @@ IDLE = [
     ),
 ]
 BUSY = [
-    ["checkpoint=ours", "precision=bf16"],
+    ["checkpoint=small-ours", "precision=bf16"],
     ["stepper=network", "kernels=torch"],
     ["video=none", "thin_body=8"],
     ["video=none", "sheet=false", "colour=rg"],  # it is stored as well
@@ -69,7 +69,7 @@ def test_validation_that_never_happens_is_told() -> None:
 
 def test_commands_and_python_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = ["garment=tank", "num_frames=2", "metrics=none", "video=none", "sheet=false", f"output={tmp_path / 'out'}"]
-    assert main(["rollout", *quick, "stepper=guess", "checkpoint=ours", "fail_on=nothing"]) == 0
-    line = "checkpoint=ours has no effect: with stepper=guess no network takes the steps"
+    assert main(["rollout", *quick, "stepper=guess", "checkpoint=small-ours", "fail_on=nothing"]) == 0
+    line = "checkpoint=small-ours has no effect: with stepper=guess no network takes the steps"
     assert capsys.readouterr().out.splitlines().count(line) == 1
-    assert line in hood.simulate("tank", num_frames=2, stepper="guess", checkpoint="ours").notes
+    assert line in hood.simulate("tank", num_frames=2, stepper="guess", checkpoint="small-ours").notes

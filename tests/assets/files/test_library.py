@@ -47,6 +47,13 @@ def test_embedded_names_win_and_files_are_found(tmp_path: Path, monkeypatch: pyt
         locate("garments", tmp_path)
 
 
+@pytest.mark.parametrize("name", ["ours", "fine15", "fine48"])
+def test_a_former_name_finds_the_same_file_and_says_its_name_of_today(name: str) -> None:
+    with pytest.warns(UserWarning, match=f"checkpoint {name} is called small-{name} now: a small model, not the paper's"):
+        assert locate("weights", name).name == f"small-{name}.safetensors"
+    assert name not in names("weights")
+
+
 def test_unknown_without_any_known() -> None:
     assert unknown("weights name", "quick", []) == "unknown weights name 'quick': known are none"
 

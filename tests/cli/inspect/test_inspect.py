@@ -72,6 +72,13 @@ def test_embedded_assets_fit(capsys: pytest.CaptureFixture[str]) -> None:
     assert "body height 1.7" in text
 
 
+def test_a_checkpoint_by_its_former_name_says_the_name_of_today(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["inspect", "ours"])
+    text = capsys.readouterr().out
+    assert "ours: checkpoint" in text
+    assert text.count("checkpoint ours is called small-ours now") == 1
+
+
 def test_z_up_and_distance_are_noticed(capsys: pytest.CaptureFixture[str], garments: dict[str, Garment]) -> None:
     tank = garments["tank"]
     faces = [f"f {a} {b} {c}" for a, b, c in tank.faces + 1]

@@ -19,7 +19,9 @@ from hood.model.graph.builder import EdgeSet, Subset, edge_set
 from hood.model.kernels import triton_step
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
+from hood.tensors import triton_device
 from hood.tensors.precision import products
+from hood.tensors.triton_device import assumed
 
 TILE = 32  # of the widest tiles
 BOUND = {torch.float32: 2e-6, torch.bfloat16: 0.015}
@@ -188,7 +190,7 @@ def test_the_graphs_cover_every_kind_of_border():
 
 def test_only_a_cuda_device_without_gradients_takes_it(monkeypatch):
     cuda, cpu = torch.device("cuda"), torch.device("cpu")
-    monkeypatch.setattr(triton_step, "_supported", lambda device: True)
+    monkeypatch.setattr(triton_device, "_supported", lambda device: True)
     assert not triton_step.applies(64, torch.float32, cuda)
     with torch.no_grad():
         assert triton_step.applies(64, torch.float32, cuda)
@@ -199,7 +201,7 @@ def test_only_a_cuda_device_without_gradients_takes_it(monkeypatch):
         assert not triton_step.applies(128, torch.float32, cuda)
         assert triton_step.applies(128, torch.bfloat16, cuda)
         assert not triton_step.applies(256, torch.bfloat16, cuda)
-        with triton_step.assumed():
+        with assumed():
             assert triton_step.applies(64, torch.float32, cpu)
             monkeypatch.setenv("HOOD_TRITON", "off")
             assert not triton_step.applies(64, torch.float32, cpu)
@@ -218,7 +220,7 @@ def test_a_network_of_an_own_class_is_asked_itself(monkeypatch):
     case = make("ring", 16, "fp32")
     monkeypatch.setattr(triton_step, "take", never)
     case.step.node_mlp.__class__ = Doubled
-    with triton_step.assumed(), torch.no_grad():
+    with assumed(), torch.no_grad():
         case.expected()
 
 
@@ -259,7 +261,7 @@ def main(cases: list[tuple[str, int, str]], path: str) -> None:
     if cases is CASES:
         for key in TAILS:
             mlp, hidden, residual = tail_of(*key)
-            with triton_step.assumed():
+            with assumed():
                 results["tail", *key] = (mlp.tail(hidden), mlp.tail(hidden, residual))
     torch.save(results, path)
 

@@ -31,8 +31,8 @@ from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep, 
 from hood.testing import without_values
 
 #: All of them; the long ones take ten seconds and more.
-MODELS = ["ours", "small1", "small2", "small3", "quickstart"]
-MODELS += [pytest.param(name, marks=pytest.mark.slow) for name in ("fine15", "fine48")]
+MODELS = ["small-ours", "small1", "small2", "small3", "quickstart"]
+MODELS += [pytest.param(name, marks=pytest.mark.slow) for name in ("small-fine15", "small-fine48")]
 #: Of the displacement in a step. Stiff cloth turns roundings of positions into forces, which quickstart sees eight times.
 LIMITS = {"quickstart": 2e-4}
 PASSES = "1x(mesh+coarse0) | 1x(mesh)"

@@ -48,13 +48,13 @@ def test_the_diameter_is_that_of_all_pairs(tank_scene: Scene) -> None:
 def test_schedules_that_reach_so_far_are_named() -> None:
     facts = reach_facts(sheet(11), 1 / 30)
     by_name = {one["name"]: one for one in facts["models"]}
-    assert (by_name["fine15"]["radius"], by_name["fine15"]["levels"]) == (15, 0)
-    assert (by_name["ours"]["radius"], by_name["ours"]["levels"]) == (48, 2)
+    assert (by_name["small-fine15"]["radius"], by_name["small-fine15"]["levels"]) == (15, 0)
+    assert (by_name["small-ours"]["radius"], by_name["small-ours"]["levels"]) == (48, 2)
     for one in facts["models"]:
         assert one["suffices"] == (one["radius"] >= facts["needed_edges"])
     far = reach_sentence(facts | {"models": [one | {"suffices": False} for one in facts["models"]]})
     assert "schedules that do: none" in far
-    assert "ours (48)" in far
+    assert "small-ours (48)" in far
 
 
 def test_where_fine_levels_are_passed_over_schedules_reach_farther(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,13 +89,13 @@ def calls() -> list[str]:
 
 def test_the_default_grid_is_the_one_described() -> None:
     config = load_config("tradeoff")
-    models = ["fine15", "fine48", "ours", "small1", "small2", "small3"]
+    models = ["small-fine15", "small-fine48", "small-ours", "small1", "small2", "small3"]
     points = make_grid(config, models).points()
     by_size = {size: [p for p in points if p.size == size and not p.alone] for size in ("1k", "4k", "12k")}
     assert {size: len(found) for size, found in by_size.items()} == {"1k": 6 * 2 * 6, "4k": 6 * 2 * 3 + 3, "12k": 2 * 2 * 2 + 4}
     for found in by_size.values():
-        assert {p.refine for p in found if (p.name, p.precision) == ("ours", "fp32")} == {0, 1, 2, 5, 10, 20}
-    assert {p.name for p in by_size["12k"]} == {"fine15", "ours"}
+        assert {p.refine for p in found if (p.name, p.precision) == ("small-ours", "fp32")} == {0, 1, 2, 5, 10, 20}
+    assert {p.name for p in by_size["12k"]} == {"small-fine15", "small-ours"}
     assert {p.refine for p in by_size["1k"]} == {0, 1, 2, 5, 10, 20}
     for size, least in (("1k", 30), ("4k", 30), ("12k", 10)):
         rollouts = len(config[f"garments_{size}"]) * len(config.sequences) * len(config[f"shapes_{size}"])
@@ -105,16 +105,16 @@ def test_the_default_grid_is_the_one_described() -> None:
 
 
 def test_the_dial_brings_its_model_to_every_size_or_is_off() -> None:
-    models = ["fine15", "ours", "quickstart"]
+    models = ["small-fine15", "small-ours", "quickstart"]
 
     def most(*overrides: str) -> dict[str, set[int]]:
         points = make_grid(load_config("tradeoff", ["precisions=[fp32]", *overrides]), models).points()
         return {name: {p.refine for p in points if (p.size, p.name) == ("12k", name)} for name in models}
 
     every = {0, 1, 2, 5, 10, 20}
-    assert most() == {"fine15": {0, 5}, "ours": every, "quickstart": set()}
-    assert most("refined=quickstart") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": every}
-    assert most("refined=none") == {"fine15": {0, 5}, "ours": {0, 5}, "quickstart": set()}
+    assert most() == {"small-fine15": {0, 5}, "small-ours": every, "quickstart": set()}
+    assert most("refined=quickstart") == {"small-fine15": {0, 5}, "small-ours": {0, 5}, "quickstart": every}
+    assert most("refined=none") == {"small-fine15": {0, 5}, "small-ours": {0, 5}, "quickstart": set()}
 
 
 def test_every_command_is_one_that_evaluate_reads() -> None:
