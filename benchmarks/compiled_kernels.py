@@ -2,10 +2,11 @@
 
     python benchmarks/compiled_kernels.py small-ours 1000          # a model by name, vertices of the dress
     python benchmarks/compiled_kernels.py quickstart 1000
+    python benchmarks/compiled_kernels.py newton 12000             # the solver, five iterations
 
 The compiler's scheduler decides on a CPU what is one kernel, and nothing is generated or run. A GPU's scheduler decides alike,
-but joins concatenations of up to eight arrays, which it counts one by one here. Printed are the operations of the traced frame,
-the kernels by kind, and their sum; an edge set of a step counts as the two kernels that it has.
+but for concatenations: it makes one kernel of up to eight arrays, and so does it here. Printed are the operations of the traced
+frame, the kernels by kind, and their sum; operators of our own count as the kernels that they have.
 """
 
 from __future__ import annotations
@@ -16,18 +17,24 @@ from collections import Counter
 from typing import Any
 
 import torch
-from gpu import Bench
+from gpu import SOLVER, Bench, frame_settings
 
 from hood.assets.files.library import locate
 from hood.model.graph.static_shapes import lay_out
+from hood.solver.system.iterate import in_double
+from hood.solver.system.plan import plan_for
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.static_shapes.cuda_graph import count_operations, trace
+from hood.steppers.static_shapes.newton_frame import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
+from hood.tensors.dense import whole_arrays
 from hood.tensors.triton_device import assumed
 
 #: Kernels of an operator that has not one.
-KERNELS = {"torch.ops.hood.step_edges.default": 2}
+KERNELS = {"torch.ops.hood.step_edges.default": 2, "torch.ops.hood.block_cg.default": 1 + 2 * frame_settings().cg_iterations}
+#: Places for body faces.
+PLACES = 64
 #: Nodes of the schedule that start nothing.
 NOTHING = ("MultiOutput",)
 
@@ -52,6 +59,7 @@ def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Counte
         raise _Counted
 
     Scheduler.codegen = count  # type: ignore[method-assign]
+    _concatenate_as_on_a_gpu()
     try:
         torch.compile(module, fullgraph=True, dynamic=False)(*inputs)
     except Exception as error:
@@ -62,22 +70,49 @@ def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Counte
     return Counter({name: number * KERNELS.get(name, 1) for name, number in found.items()})
 
 
+def _concatenate_as_on_a_gpu() -> None:
+    from torch._inductor import config, lowering
+
+    plain = lowering.lowerings[torch.ops.aten.cat.default]
+
+    def concatenate(inputs: Any, dim: int = 0) -> Any:
+        with config.patch(force_pointwise_cat=len(inputs) <= config.max_pointwise_cat_inputs):
+            return plain(inputs, dim)
+
+    lowering.lowerings |= {name: concatenate for name, value in lowering.lowerings.items() if value is plain}
+
+
 @torch.no_grad()
 def main(model: str, size: int) -> None:
     torch.set_num_threads(1)
-    bench, simulator = Bench(size, "cpu", 1), load_simulator(locate("weights", model)).eval()
+    bench = Bench(size, "cpu", 1)
+    function, inputs = newton_frame(bench) if model == SOLVER else network_frame(bench, model)
+    with assumed():
+        module = trace(function, inputs)
+        kernels = schedule(module, inputs)
+    print(f"{model}, {size:,} vertices: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels")
+    for name, number in kernels.most_common():
+        print(f"{number:6,}  {name}")
+
+
+def newton_frame(bench: Bench) -> tuple[Any, list[torch.Tensor]]:
     problem = bench.problems[0]
+    like, inputs = problem.with_fold(), step_inputs(problem, surface=True)
+    potential = settled_potential(bench.potential, problem)
+    given = potential, like, plan_for(in_double(like)), PLACES, frame_settings()
+    with whole_arrays():
+        NewtonFrame(*given)(*inputs)  # what is made once per cloth is no part of a frame
+    return NewtonFrame(*given, dense=True), inputs
+
+
+def network_frame(bench: Bench, model: str) -> tuple[Any, list[torch.Tensor]]:
+    problem, simulator = bench.problems[0], load_simulator(locate("weights", model)).eval()
     static = simulator.prepare(problem.cloth, bench.scene.garment.rest_pos).static
     assert static is not None
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
     layout = lay_out(static, CapturedSimulator(simulator, "fixed")._first_capacity(problem))
     inputs = step_inputs(problem, simulator.needs_contact)
-    with assumed():
-        module = trace(FixedStep(simulator, layout, problem, dense=True, potential=potential), inputs)
-        kernels = schedule(module, inputs)
-    print(f"{model}, {size:,} vertices: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels")
-    for name, number in kernels.most_common():
-        print(f"{number:6,}  {name}")
+    return FixedStep(simulator, layout, problem, dense=True, potential=potential), inputs
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ the minutes are over; what was left out is said at the end. Columns:
 
 ``way``       of a network: ``plain``; ``captured``: fixed shapes, one CUDA graph; ``fused``: the same with the network's
               steps in Triton; ``compiled``: that by torch.compile. Of the solver, with so many Newton iterations: ``plain``;
-              ``captured``: a graph for each of its pieces.
+              ``captured``: a graph for each of its pieces; ``compiled``: all of them one function through torch.compile.
 ``ms``        of a frame, search included, metrics not: median of wall-clock time between two waits for the device, ways taking
               turns state by state.
 ``floor ms``  what the frame's kernels take at least, one after the other: for each the longest of the gap between two kernels,
@@ -68,6 +68,7 @@ from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays
+from hood.tensors.triton_device import has_triton
 from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"
@@ -226,6 +227,11 @@ def solver_settings(iterations: int) -> NewtonSettings:
     return NewtonSettings(target_rg=1e-6, max_iterations=iterations, engine="torch")
 
 
+def frame_settings(iterations: int = 5) -> NewtonSettings:
+    """Of a frame that asks nobody when to stop."""
+    return NewtonSettings(target_rg=1e-6, max_iterations=iterations, cg_iterations=75, engine="torch")
+
+
 # ---- time ------------------------------------------------------------------------------------------------------------
 
 
@@ -358,6 +364,23 @@ def solver_rows(table: Table, bench: Bench, iterations: int, device: Device, on_
         table.add(_row(bench, f"{SOLVER} {iterations}", "fp64", way, works[way], floor, times.get(way), launches, gamma))
 
 
+@torch.no_grad()
+def solver_frame_row(table: Table, bench: Bench, iterations: int, device: Device) -> None:
+    """Of the whole step as one function, beside the plain one; on a GPU with Triton."""
+    if not has_triton(bench.there.cloth.rest_pos.device):
+        return
+    settings, problems = frame_settings(iterations), bench.on_device()
+    there = NewtonStepper(bench.potential, settings)
+    there.gravity = there.gravity.to(bench.there.cloth.rest_pos.device)
+    work = solver_work(bench, NewtonStepper(bench.potential, settings))
+    calls = {"plain": partial(_step, there, None), COMPILED: partial(_step, CapturedNewton(there, COMPILED), None)}
+    times = time_ways(calls, problems)
+    for way, call in calls.items():
+        launches, gamma = count_launches(partial(call, problems[0])), bench.gamma([call(problem) for problem in problems])
+        floor = 1e3 * device.seconds(work, captured=way == COMPILED)
+        table.add(_row(bench, f"{SOLVER} {iterations}", "fp64", way, work, floor, times.get(way), launches, gamma))
+
+
 def _row(
     bench: Bench,
     method: str,
@@ -404,7 +427,7 @@ def jobs(sizes: list[int], models: list[str]) -> list[tuple[int, str, str | int]
     first: list[tuple[int, str, str | int]] = []
     for size in sizes:
         first += [(size, models[0], "fp32"), (size, SOLVER, 5)]
-    first += [(sizes[0], model, COMPILED) for model in models[:2]]
+    first += [(sizes[0], model, COMPILED) for model in (*models[:2], SOLVER)]
     rest: list[tuple[int, str, str | int]] = []
     for size in sizes:
         rest += [(size, model, "fp32") for model in models[1:]]
@@ -427,11 +450,15 @@ def run(args: argparse.Namespace, on_gpu: bool) -> None:
             continue
         if size not in benches:
             benches[size] = Bench(size, "cuda" if on_gpu else "cpu", 1 if size > 20000 else 3)
-        if kind == SOLVER:
+        if choice == COMPILED and not on_gpu:
+            continue
+        if kind == SOLVER and choice == COMPILED:
+            solver_frame_row(table, benches[size], 5, device)
+        elif kind == SOLVER:
             solver_rows(table, benches[size], int(choice), device, on_gpu)
-        elif choice == COMPILED and on_gpu:
+        elif choice == COMPILED:
             network_rows(table, benches[size], kind, "fp32", device, on_gpu, ("plain", COMPILED))
-        elif choice != COMPILED:
+        else:
             network_rows(table, benches[size], kind, str(choice), device, on_gpu)
     print("\n" + "\n".join(crossover(table.rows)))
     if left:

@@ -93,8 +93,8 @@ def _nearest(
 
 
 def _pairs_at_once(points: Tensor) -> int:
-    """How many distances are in memory together: 16 MB of them in the cache of a CPU, 256 MB and few kernels on a GPU."""
-    return CHUNK_PAIRS if points.device.type == "cpu" and not is_whole() else 16 * CHUNK_PAIRS
+    """How many distances are in memory together: 16 MB of them in the cache of a CPU, 512 MB and few kernels on a GPU."""
+    return CHUNK_PAIRS if points.device.type == "cpu" and not is_whole() else 32 * CHUNK_PAIRS
 
 
 def _exhaustive(

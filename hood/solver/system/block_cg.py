@@ -17,8 +17,8 @@ from hood.solver.system.linear import by_blocks, conjugate_gradients
 from hood.solver.system.sparsity import BlockPattern
 from hood.tensors.triton_device import has_triton
 
-#: Rows of a tile, and partial sums that are read at once.
-TILE, CHUNK = 64, 128
+#: Rows of a tile, partial sums that are read at once, and warps of a program.
+TILE, CHUNK, WARPS = 64, 128, 2
 
 
 class BlockRows(NamedTuple):
@@ -69,12 +69,11 @@ def block_cg(
         return _in_torch(BlockRows(*rows), triples, inverse, right, tolerance, iterations)
     columns, starts, _, *tables, scene_tiles = rows
     tiles, scenes = len(tables[0]), len(tolerance)
-    number = {"dtype": right.dtype, "device": right.device}
     x, r, z, q, even, odd = (torch.empty_like(right) for _ in range(6))
-    rz, pq = torch.empty(iterations + 1, tiles, **number), torch.empty(max(iterations, 1), tiles, **number)
+    rz, pq = right.new_empty(iterations + 1, tiles), right.new_empty(max(iterations, 1), tiles)
     stopped = torch.empty(iterations + 1, scenes, dtype=torch.int32, device=right.device)
     indefinite = torch.empty(scenes, dtype=torch.int32, device=right.device)
-    kernels, options = _kernels(), {"TILE": TILE, "num_warps": 2}
+    kernels, options = _kernels(), {"TILE": TILE, "num_warps": WARPS}
     kernels.begin_pass[(tiles,)](right, inverse, x, r, z, odd, rz, stopped, indefinite, *tables, **options)
     for index in range(iterations):
         before, p = (odd, even) if index % 2 == 0 else (even, odd)

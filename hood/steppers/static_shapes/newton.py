@@ -1,4 +1,5 @@
-"""The solver's step with fixed shapes: on CUDA a few graphs, between which the host reads how far it has come."""
+"""The solver's step with fixed shapes: on CUDA a few graphs, between which the host reads how far it has come, or, with a
+number of iterations that is known before, one compiled function that asks nobody."""
 
 from __future__ import annotations
 
@@ -13,12 +14,13 @@ from hood.energies.potential import keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.vertices import terms_without_form
 from hood.solver.newton import Report, run
-from hood.solver.step_figures import reason_number
+from hood.solver.step_figures import CONVERGED, MOST_ITERATIONS, reason_number
 from hood.solver.system.iterate import rounded
 from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
-from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory
+from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, trace
+from hood.steppers.static_shapes.newton_frame import NewtonFrame
 from hood.steppers.static_shapes.newton_pieces import FixedSystem, MaskedStep
 from hood.steppers.static_shapes.problem import (
     Constants,
@@ -33,14 +35,18 @@ if TYPE_CHECKING:
     from hood.steppers.newton import NewtonStepper
 
 #: How the solver's step of fixed shapes is taken.
-_MODES = ("fixed", "captured")
+_MODES = ("fixed", "captured", "compiled")
+#: A compiled step takes all iterations it is made for; more than these make no frame worth compiling.
+MOST, MOST_CG = 20, 200
 
 
 class CapturedNewton:
     """Takes the steps of a :class:`hood.steppers.newton.NewtonStepper` in pieces of fixed shapes, the search included.
 
     Args:
-        mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph for every piece.
+        mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph for every piece; ``compiled``: all of
+            ``solver.max_iterations`` with at most ``solver.cg_iterations`` each, as one function through torch.compile, and on
+            CUDA captured as well.
 
     Raises:
         ValueError: another mode, ``captured`` without CUDA, or settings that have no such form.
@@ -51,15 +57,22 @@ class CapturedNewton:
 
     def __init__(self, stepper: NewtonStepper, mode: str = "captured") -> None:
         if mode not in _MODES:
-            raise ValueError(f"step={mode} serves networks; the solver takes steps plain, {' or '.join(_MODES)}")
+            raise ValueError(f"step={mode} is none of the solver's; choose plain, {' or '.join(_MODES)}")
         if mode == "captured" and stepper.gravity.device.type != "cuda":
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
         if stepper.settings.linear != "cg":
             raise ValueError(f"solver.linear={stepper.settings.linear} has no form of fixed shapes; use cg or step=plain")
+        settings = stepper.settings
+        if mode == "compiled" and (settings.max_iterations > MOST or settings.cg_iterations > MOST_CG):
+            raise ValueError(
+                f"step=compiled takes all of solver.max_iterations={settings.max_iterations} and cg_iterations="
+                f"{settings.cg_iterations} whatever a step needs: give at most {MOST} and {MOST_CG}, such as "
+                "solver.max_iterations=5 solver.cg_iterations=75"
+            )
         self.stepper, self.mode = stepper, mode
         self.gravity, self.config, self.metrics = stepper.gravity, stepper.config, stepper.metrics
         self.solves_to = stepper.solves_to
-        self._plan: _Plan | None = None
+        self._plan: _Plan | _Frame | None = None
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
         """Nothing: what is known of a cloth is kept with the step."""
@@ -90,35 +103,71 @@ class CapturedNewton:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
         return self.stepper.next_velocity(problem, prediction)
 
-    def _make_plan(self, problem: StepProblem, places: int) -> _Plan:
+    def _make_plan(self, problem: StepProblem, places: int) -> _Plan | _Frame:
         self._plan = None  # its memory is free before there is another
-        self._plan = _Plan(self.stepper, problem, places, self.mode == "captured")
+        if self.mode == "compiled":
+            self._plan = _Frame(self.stepper, problem, places)
+        else:
+            self._plan = _Plan(self.stepper, problem, places, self.mode == "captured")
         return self._plan
 
 
-class _Plan:
-    """The pieces for problems of one shape, and the memory of their inputs."""
+class _Fixed:
+    """What is known of problems of one shape, and the memory of their inputs."""
 
-    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int, captured: bool) -> None:
+    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int) -> None:
         self.places, self._stepper, self._like = places, stepper, problem
         self._constants, self._shape = Constants(problem, stepper.potential), step_shape(problem, surface=True)
         self._inputs = InputMemory(step_inputs(problem, surface=True))
-        potential, known = settled_potential(stepper.potential, problem), problem.with_fold()
-        self._potential, self._folds = potential, keeps_both_sides(potential)
-        others = terms_without_form(potential, known)
+        self._potential, self._known = settled_potential(stepper.potential, problem), problem.with_fold()
+        others = terms_without_form(self._potential, self._known)
         if others is not None:
             raise ValueError(
                 f"losses.terms.{next(iter(others.terms))}: its second derivatives are not written out, which steps of fixed "
                 "shapes need: use step=plain"
             )
-        settings = stepper.settings
-        record = _recorded if captured else None
-        self._system = FixedSystem(potential, self._read, plan_for(known), settings.cg_iterations, settings.double, record)
 
     def is_stale(self, problem: StepProblem) -> bool:
         """Whether a problem needs another plan."""
         same = step_shape(problem, surface=True) == self._shape
         return not same or not self._constants.hold(problem, self._stepper.potential)
+
+
+class _Frame(_Fixed):
+    """The whole step as one compiled function."""
+
+    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int) -> None:
+        super().__init__(stepper, problem, places)
+        memory, plan = self._inputs.tensors, plan_for(self._known)
+        frame = NewtonFrame(self._potential, self._known, plan, places, stepper.settings, dense=True)
+        self._run: Run = torch.compile(trace(frame, memory), fullgraph=True, dynamic=False)
+        if memory[0].device.type == "cuda":
+            self._run = CudaGraph(self._run, memory)
+
+    def enter(self, problem: StepProblem) -> int:
+        """Take the step of a problem; the number of body faces that need a place."""
+        *self._reached, faces = self._run(*self._inputs.load(step_inputs(problem, surface=True)))
+        return int(faces)
+
+    def minimize(self, problem: StepProblem, began: float) -> tuple[Tensor, Report]:
+        """Positions (V, 3) at t + 1 of the problem whose step has been taken."""
+        settings, (pos, acc, residual) = self._stepper.settings, (value.clone() for value in self._reached)
+        converged = residual <= settings.target_rg
+        reason = tuple(CONVERGED if done else MOST_ITERATIONS for done in converged.tolist())
+        used, phi = settings.max_iterations * settings.cg_iterations, torch.full_like(residual, torch.nan)
+        return pos, Report(settings.max_iterations, used, phi, residual, converged, reason, acc)
+
+
+class _Plan(_Fixed):
+    """The pieces for problems of one shape."""
+
+    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int, captured: bool) -> None:
+        super().__init__(stepper, problem, places)
+        settings, potential = stepper.settings, self._potential
+        self._folds, record = keeps_both_sides(potential), _recorded if captured else None
+        self._system = FixedSystem(
+            potential, self._read, plan_for(self._known), settings.cg_iterations, settings.double, record
+        )
 
     def enter(self, problem: StepProblem) -> int:
         """Take up a problem; the number of body faces that need a place."""

@@ -26,99 +26,26 @@ CG_PIECE = 8
 MaskedStep = Callable[[], None]
 
 
-class FixedSystem:
-    """The unknowns of a step in such pieces; see :class:`hood.solver.newton.System`.
-
-    Pieces hand tensors over as attributes. Recorded one after the other, as they are below, they read and write the same memory
-    in every replay.
+class Pieces:
+    """What a step of Newton's method is made of. Pieces hand tensors over as attributes.
 
     Args:
         potential: settled, all terms with a closed form.
-        read: the present problem, with its contact; what it reads may change its values, not its shapes.
-        plan: of the problem's cloth, as is everything else that a problem is like.
-        record: makes a piece that does the same, faster; None leaves them as they are.
+        like: a problem with its contact.
+        plan: of the problem's cloth, as is everything else that problems are like.
     """
 
     def __init__(
-        self,
-        potential: Potential,
-        read: Callable[[], StepProblem],
-        plan: SolverPlan,
-        cg_iterations: int,
-        double: bool = True,
-        record: Callable[[MaskedStep], MaskedStep] | None = None,
+        self, potential: Potential, like: StepProblem, plan: SolverPlan, cg_iterations: int, double: bool = True
     ) -> None:
-        self._potential, self._read, self._plan, self._double = potential, read, plan, double
-        self._cg_iterations, self._used = cg_iterations, 0
-        self._tables(read())
-        named = ("enter", "guess", "take_up", "assemble", "direct", "sharpen", "solve", "judge", "aim", "attempt")
-        self.pieces: dict[str, MaskedStep] = {}
-        for name in named:
-            piece: MaskedStep = getattr(self, f"_{name}")
-            self.pieces[name] = piece if record is None else record(piece)
-            if record is not None:
-                # To record computes nothing: what the next piece reads has to be there when it is tried out.
-                self.pieces[name]()
-
-    # ---- what the host does ------------------------------------------------------------------------------------------
-
-    def enter(self) -> None:
-        """Take up the present problem; the state is undefined until :meth:`begin`."""
-        self.pieces["enter"]()
-        self._used = 0
-        self._sharpness.zero_()
-
-    def begin(self, start: Tensor | None) -> None:
-        """Take up positions (V, 3), or the better of the two first guesses."""
-        if start is None:
-            self.pieces["guess"]()
-            return
-        self._start.copy_(start)
-        self.pieces["take_up"]()
-
-    @property
-    def phi(self) -> list[float]:
-        """(B) J."""
-        return [float(value) for value in self._phi.tolist()]
-
-    @property
-    def used(self) -> int:
-        """Conjugate gradient iterations so far, those of the last piece that changed nothing included."""
-        return self._used
-
-    def model(self) -> list[float]:
-        """Make the quadratic model of the state; the relative gradients (B)."""
-        self.pieces["assemble"]()
-        return [float(value) for value in self._residual.tolist()]
-
-    def move(self, residual: list[float], active: list[bool]) -> list[bool]:
-        """Take a Newton step in the scenes ``active`` (B); which of them moved (B)."""
-        self._active.copy_(torch.tensor(active))
-        self.pieces["direct"]()
-        while bool(self._pending.any()):
-            self.pieces["sharpen"]()
-            for _ in range(-(-self._cg_iterations // CG_PIECE)):
-                self.pieces["solve"]()
-                self._used += CG_PIECE
-                if not bool(self._running.any()):
-                    break
-            self.pieces["judge"]()
-        self.pieces["aim"]()
-        for _ in range(BACKTRACKS):
-            if not bool(self._searching.any()):
-                break
-            self.pieces["attempt"]()
-        return [bool(value) for value in self._moved.tolist()]
-
-    def state(self) -> tuple[Tensor, Tensor]:
-        """Positions (V, 3) and the accelerations (V, 3) that lead there."""
-        return self._pos.clone(), self._acc.clone()
+        self._potential, self._plan, self._double, self._cg_iterations = potential, plan, double, cg_iterations
+        self._tables(like)
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def _tables(self, like: StepProblem) -> None:
-        """Constants of the cloth, and the memory that pieces write to."""
+        """Constants of the cloth."""
         like = in_double(like) if self._double else like
         plan, pos, num_scenes = self._plan, like.state.pos, like.num_scenes
         pattern, device = plan.pattern, pos.device
@@ -131,8 +58,13 @@ class FixedSystem:
         gravity = float(like.gravity.norm()) or STANDARD_GRAVITY
         weight = like.cloth.free * like.cloth.mass * gravity
         self._weight = like.sum_vertices(weight**2).sqrt()
-        self._free = like.cloth.free.to(pos.dtype)
-        none = torch.zeros(num_scenes, dtype=torch.bool, device=device)
+        self._free, self._like_pos = like.cloth.free.to(pos.dtype), pos
+        self._memory()
+
+    def _memory(self) -> None:
+        """Make the memory that pieces write to."""
+        pos, plan, num_scenes = self._like_pos, self._plan, self._num_scenes
+        none = torch.zeros(num_scenes, dtype=torch.bool, device=pos.device)
         self._active, self._pending, self._running, self._searching = (none.clone() for _ in range(4))
         self._indefinite, self._halved, self._moved = (none.clone() for _ in range(3))
         number = pos.new_zeros(num_scenes)
@@ -153,8 +85,7 @@ class FixedSystem:
     # ---- pieces ------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def _enter(self) -> None:
-        problem = self._read()
+    def _take_problem(self, problem: StepProblem) -> None:
         self._problem = in_double(problem) if self._double else problem
         self._unknowns = Unknowns(self._potential, self._problem)
         self._build = ModelBuilder(self._unknowns.terms, self._plan)
@@ -288,3 +219,93 @@ class FixedSystem:
 
     def _sum(self, values: Tensor, scene: Tensor) -> Tensor:
         return sum_per_scene(values, scene, self._num_scenes)
+
+
+class FixedSystem(Pieces):
+    """The unknowns of a step in such pieces; see :class:`hood.solver.newton.System`.
+
+    Recorded one after the other, as they are below, pieces read and write the same memory in every replay.
+
+    Args:
+        potential: settled, all terms with a closed form.
+        read: the present problem, with its contact; what it reads may change its values, not its shapes.
+        plan: of the problem's cloth, as is everything else that a problem is like.
+        record: makes a piece that does the same, faster; None leaves them as they are.
+    """
+
+    def __init__(
+        self,
+        potential: Potential,
+        read: Callable[[], StepProblem],
+        plan: SolverPlan,
+        cg_iterations: int,
+        double: bool = True,
+        record: Callable[[MaskedStep], MaskedStep] | None = None,
+    ) -> None:
+        super().__init__(potential, read(), plan, cg_iterations, double)
+        self._read, self._used = read, 0
+        named = ("enter", "guess", "take_up", "assemble", "direct", "sharpen", "solve", "judge", "aim", "attempt")
+        self.pieces: dict[str, MaskedStep] = {}
+        for name in named:
+            piece: MaskedStep = getattr(self, f"_{name}")
+            self.pieces[name] = piece if record is None else record(piece)
+            if record is not None:
+                # To record computes nothing: what the next piece reads has to be there when it is tried out.
+                self.pieces[name]()
+
+    def _enter(self) -> None:
+        self._take_problem(self._read())
+
+    # ---- what the host does ------------------------------------------------------------------------------------------
+
+    def enter(self) -> None:
+        """Take up the present problem; the state is undefined until :meth:`begin`."""
+        self.pieces["enter"]()
+        self._used = 0
+        self._sharpness.zero_()
+
+    def begin(self, start: Tensor | None) -> None:
+        """Take up positions (V, 3), or the better of the two first guesses."""
+        if start is None:
+            self.pieces["guess"]()
+            return
+        self._start.copy_(start)
+        self.pieces["take_up"]()
+
+    @property
+    def phi(self) -> list[float]:
+        """(B) J."""
+        return [float(value) for value in self._phi.tolist()]
+
+    @property
+    def used(self) -> int:
+        """Conjugate gradient iterations so far, those of the last piece that changed nothing included."""
+        return self._used
+
+    def model(self) -> list[float]:
+        """Make the quadratic model of the state; the relative gradients (B)."""
+        self.pieces["assemble"]()
+        return [float(value) for value in self._residual.tolist()]
+
+    def move(self, residual: list[float], active: list[bool]) -> list[bool]:
+        """Take a Newton step in the scenes ``active`` (B); which of them moved (B)."""
+        self._active.copy_(torch.tensor(active))
+        self.pieces["direct"]()
+        while bool(self._pending.any()):
+            self.pieces["sharpen"]()
+            for _ in range(-(-self._cg_iterations // CG_PIECE)):
+                self.pieces["solve"]()
+                self._used += CG_PIECE
+                if not bool(self._running.any()):
+                    break
+            self.pieces["judge"]()
+        self.pieces["aim"]()
+        for _ in range(BACKTRACKS):
+            if not bool(self._searching.any()):
+                break
+            self.pieces["attempt"]()
+        return [bool(value) for value in self._moved.tolist()]
+
+    def state(self) -> tuple[Tensor, Tensor]:
+        """Positions (V, 3) and the accelerations (V, 3) that lead there."""
+        return self._pos.clone(), self._acc.clone()
