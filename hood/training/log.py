@@ -26,6 +26,18 @@ from hood.assets.files.said import install, say
 from hood.energies.potential import scale
 from hood.energies.problem import StepProblem
 
+#: An output whose spread is less is one constant.
+CONSTANT = 1e-3
+
+
+def output_spread(acc: Tensor, free: Tensor) -> float:
+    """How much of the accelerations (V, 3) differs between the vertices that are ``free`` (V,): the root of the mean square of
+    what deviates from their mean, over that of all. 1 where all are zero."""
+    rows = free.unsqueeze(1).to(acc)
+    mean = (acc * rows).sum(dim=0) / rows.sum().clamp_min(1.0)
+    all_of_it = float((acc * rows).norm())
+    return float(((acc - mean) * rows).norm()) / all_of_it if all_of_it > 0 else 1.0
+
 
 class Clock:
     """Runs while training does; what is :meth:`paused` does not count."""

@@ -153,6 +153,23 @@ def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sa
     assert scaled["loss"] == pytest.approx(plain["loss"] / (1.0 + scaled["relative_gradient"] / 3.0), rel=1e-5)
 
 
+def test_a_network_whose_units_died_is_told_once(
+    tmp_path: Path, sampler: SceneSampler, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its output is one constant: the loss goes on as if nothing were wrong."""
+    paper = {"features": "paper", "output": "acceleration"}
+    alive = make(tmp_path / "alive", sampler, paper)
+    alive.run()
+    assert "the network gives every vertex the same" not in capsys.readouterr().err
+    assert all(line["output_spread"] > 0.01 for line in metrics(tmp_path / "alive"))
+    dead = make(tmp_path / "dead", sampler, paper)
+    with torch.no_grad():
+        dead.simulator.network.decoder.second.bias.fill_(-1e3)
+    dead.run()
+    assert capsys.readouterr().err.count("the network gives every vertex the same acceleration") == 1
+    assert all(line["output_spread"] < 1e-6 for line in metrics(tmp_path / "dead"))
+
+
 def metrics(folder: Path) -> list[dict]:
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{key: value for key, value in line.items() if key != "iterations_per_second"} for line in lines]

@@ -55,6 +55,7 @@ def take(
     subsets: Mapping[str, Subset],
     overwrite: bool = False,
     precision: str = "tf32x3",
+    memory: dict[tuple[str, ...], Tensor] | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """New latents of the nodes (R, d) float32, and of the edges by set.
 
@@ -66,6 +67,8 @@ def take(
         subsets: which rows of a set take part.
         overwrite: write new latents over the old ones.
         precision: of products of float32, one of :data:`INPUT_PRECISIONS`.
+        memory: of the sums, by the sets of a step; steps with the same ``subsets`` and latents share it. Nodes that receive
+            nothing have zeros there, which are written once.
 
     Raises:
         ValueError: another precision.
@@ -75,7 +78,11 @@ def take(
     names = [name for name in step.sets if subsets[name].edges.num_edges]
     updated, width = dict(edges), step.latent_dim
     low = nodes.to(next(iter(edges.values())).dtype)
-    received = low.new_zeros(len(step.sets), *nodes.shape)
+    received = None if memory is None else memory.get(step.sets)
+    if received is None:
+        received = low.new_zeros(len(step.sets), *nodes.shape)
+    if memory is not None:
+        memory[step.sets] = received
     if names:
         tables = _tables([cast("MLP", step.edge_mlps[name]) for name in names], low, width)
         for place, name in enumerate(names):

@@ -157,15 +157,21 @@ class ProcessorStep(nn.Module):
         self.node_mlp = MLP((1 + len(self.sets)) * latent_dim, latent_dim, latent_dim)
 
     def forward(
-        self, nodes: Tensor, edges: Mapping[str, Tensor], subsets: Mapping[str, Subset], overwrite: bool = False
+        self,
+        nodes: Tensor,
+        edges: Mapping[str, Tensor],
+        subsets: Mapping[str, Subset],
+        overwrite: bool = False,
+        memory: dict[tuple[str, ...], Tensor] | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part.
 
         With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. Without gradients
-        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`.
+        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`, which keeps in ``memory`` what steps with the same
+        sets and subsets write to.
         """
         if triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device) and self._is_own():
-            return triton_step.take(self, nodes, edges, subsets, overwrite, triton_step.input_precision())
+            return triton_step.take(self, nodes, edges, subsets, overwrite, triton_step.input_precision(), memory)
         # The node network's first layer by columns: aggregates exist only at the nodes that have an edge in the set.
         first = self.node_mlp.first
         own, *parts = first.weight.split(self.latent_dim, dim=1)
