@@ -167,8 +167,8 @@ class ProcessorStep(nn.Module):
         """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part.
 
         With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. Without gradients
-        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`, which keeps in ``memory`` what steps with the same
-        sets and subsets write to.
+        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`, which keeps in ``memory`` what steps with the
+        same sets and subsets write to.
         """
         if triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device) and self._is_own():
             return triton_step.take(self, nodes, edges, subsets, overwrite, triton_step.input_precision(), memory)
