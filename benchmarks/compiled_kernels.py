@@ -29,7 +29,7 @@ from hood.steppers.static_shapes.newton_frame import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays
-from hood.tensors.triton_device import assumed
+from hood.tensors.precision import assumed
 
 #: Kernels of an operator that has not one.
 KERNELS = {"torch.ops.hood.step_edges.default": 2, "torch.ops.hood.block_cg.default": 1 + 2 * frame_settings().cg_iterations}

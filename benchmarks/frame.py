@@ -1,7 +1,7 @@
 """Where the time of a rollout's frame goes: body search, features, network, the rest; and what its metrics cost apart.
 
     python benchmarks/frame.py --sizes 1000 4000 --models small-ours.safetensors quickstart.safetensors --forms torch fused
-    python benchmarks/frame.py --sizes 1000 5000 12000 --models small-fine15 small-ours --precision fp32 bf16 --forms torch
+    python benchmarks/frame.py --sizes 1000 5000 12000 --models fine15 ours --precision fp32 bf16 --forms torch
 
 The embedded dress, refined to the given number of vertices, on the embedded body of 6,890 vertices, walking. A model is an
 architecture with random weights, or the name of embedded weights. Every frame starts from the garment skinned to the body's
@@ -155,7 +155,7 @@ def run(size: int, model: str, forms: list[tuple[str, str]], frames: int) -> Non
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 5000])
-    parser.add_argument("--models", nargs="+", default=["small-fine15", "small-ours"])
+    parser.add_argument("--models", nargs="+", default=["fine15", "ours"])
     parser.add_argument("--precision", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--forms", nargs="+", default=["torch"], choices=KERNELS)
     parser.add_argument("--frames", type=int, default=9)

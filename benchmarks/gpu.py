@@ -68,7 +68,7 @@ from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays
-from hood.tensors.triton_device import has_triton
+from hood.tensors.precision import has_triton
 from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"

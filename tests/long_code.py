@@ -37,6 +37,7 @@ MODULES = {
     "hood/solver/compiled/system.py": "one object in C++: its buffers, its calls, its float64 form",
     "hood/solver/derivatives/elements.py": "energies and derivatives of every element, and the damping of the same forms",
     "hood/solver/newton.py": "Newton's method: settings, report, iterations, and the same from any place",
+    "hood/steppers/static_shapes/newton_pieces.py": "the pieces of one Newton step, and the host's way through them",
     "hood/solver/vertex/gauss_seidel.py": "coloured sweeps: the colouring and the step of a vertex",
     "hood/steppers/network.py": "the learned step from search to next positions, and how it is built from a config",
     "hood/steppers/published.py": "published weights: names, layouts and conventions in one table",

@@ -34,9 +34,9 @@ from hood.assets.files.library import locate, motion_split, unknown
 from hood.assets.files.said import ProgressLines
 from hood.assets.garment.garment import load_garment
 from hood.assets.material import Material
-from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles, find_motions
+from hood.assets.motion.skeleton import UP_AXES
 from hood.energies.potential import Potential
 from hood.energies.self_contact import for_networks
 from hood.evaluation.validation import Validation

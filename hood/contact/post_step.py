@@ -31,7 +31,7 @@ from hood.mesh.closest_point.search import build_incidence, search_surface
 from hood.mesh.closest_point.tree import Match
 from hood.mesh.penetration.compiled import Eights, eights
 from hood.mesh.penetration.crossing import crossings
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 #: Vertices no deeper than this [m] have not entered: contact gives way by some millimetres.
 ENTERED_DEPTH = 4e-3

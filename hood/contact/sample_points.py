@@ -20,8 +20,8 @@ from hood.contact.contact import Contact, match_surface
 from hood.mesh import topology
 from hood.mesh.closest_point.search import build_incidence
 from hood.mesh.geometry import normals_of_fans, vertex_masses
+from hood.tensors.batch import forget
 from hood.tensors.dense import add_rows
-from hood.tensors.weak_cache import forget
 
 #: Where the cloth meets the body: at its vertices alone; at the midpoints of its edges as well; at the midpoints of its rims
 #: and, face by face, where vertices of the body are nearest.

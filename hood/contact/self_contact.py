@@ -17,7 +17,7 @@ from hood.cloth.cloth import Cloth
 from hood.mesh.closest_point.search import closest_point_on_triangles
 from hood.mesh.cloth_proximity import ClothSurface, Contacts, Followed, LayerMesh, follow, vertex_room
 from hood.mesh.topology import Rings, unique_edges
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 #: Beside a face by more than this [m] a vertex is paired with it only where it is the nearest one.
 _BESIDE = 3e-3

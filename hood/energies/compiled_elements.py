@@ -24,7 +24,7 @@ from hood.energies.membrane import Stretching, weave_roots
 from hood.energies.problem import StepProblem
 from hood.native.arguments import COUNT, POINTER, fields
 from hood.native.build import optional
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 if TYPE_CHECKING:  # potentials use this pass
     from hood.energies.potential import Potential, Term

@@ -33,7 +33,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 
 def weave_roots(cloth: Cloth, dtype: torch.dtype | None = None) -> Tensor | None:

@@ -15,8 +15,8 @@ from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.topology import boundary_loops, connected_components
+from hood.tensors.batch import forget
 from hood.tensors.dense import add_rows
-from hood.tensors.weak_cache import forget
 
 #: Pascal, one atmosphere: no garment holds more.
 _MOST = 1e5

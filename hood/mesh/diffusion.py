@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from hood.native import features
+from hood.tensors.batch import forget
 from hood.tensors.dense import RowSums
-from hood.tensors.weak_cache import forget
 
 
 class Diffusion:

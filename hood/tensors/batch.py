@@ -1,11 +1,13 @@
 """Concatenate frozen dataclasses of tensors into one flat batch: indices shifted, everything else stacked end to end.
 
 Selection by a mask into a fixed number of rows, as captured graphs need it.
+
+A cache keyed by the identity of an object, such as a batch, which does not outlive it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import Field, field, fields
 from typing import Any, TypeVar
 
@@ -75,3 +77,13 @@ def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dt
             value = value.to(device=device, dtype=None if keep else dtype)
         moved[spec.name] = value
     return type(item)(**moved)
+
+
+def forget(kept: MutableMapping[Any, Any], key: Any) -> Callable[[Any], None]:
+    """For :class:`weakref.ref`: takes ``key`` out of ``kept`` when the object is gone; works while Python shuts down, too, when
+    the names of modules are gone as well."""
+
+    def remove(_: Any) -> None:
+        kept.pop(key, None)
+
+    return remove

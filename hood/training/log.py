@@ -39,6 +39,25 @@ def output_spread(acc: Tensor, free: Tensor) -> float:
     return float(((acc - mean) * rows).norm()) / all_of_it if all_of_it > 0 else 1.0
 
 
+class ConstantOutput:
+    """Says once that a network's output has become a constant: a gradient that reaches one cannot bring the network back."""
+
+    def __init__(self, learning_rate: float) -> None:
+        self._rate, self._told = learning_rate, False
+
+    def look(self, iteration: int, spread: float) -> None:
+        """With the mean of :func:`output_spread` since the last look."""
+        if spread >= CONSTANT or self._told:
+            return
+        self._told = True
+        say(
+            f"hood: iteration {iteration}: the network gives every vertex the same acceleration, whatever it is shown. The "
+            "units of its decoder are dead, and nothing is learned any more; begin again with a lower trainer.learning_rate "
+            f"than {self._rate:g}",
+            error=True,
+        )
+
+
 class Clock:
     """Runs while training does; what is :meth:`paused` does not count."""
 

@@ -34,8 +34,8 @@ from hood.training.checkpoint import (
     set_generator_states,
 )
 from hood.training.log import (
-    CONSTANT,
     Clock,
+    ConstantOutput,
     LogWindow,
     MetricsLog,
     Skipped,
@@ -116,7 +116,7 @@ class Trainer:
         self.best = math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: _Observer | None = None
-        self._told_constant = False
+        self._constant = ConstantOutput(settings.learning_rate)
         self._skips = Skipped()
         self._rollbacks_in_row = 0
         self._failed_at = -1
@@ -171,7 +171,8 @@ class Trainer:
                 if last or self.iteration % settings.log_every == 0:
                     means = self._window.close()
                     self._log({**means, "iterations_per_second": clock.rate(self.iteration)})
-                    self._tell_if_constant(means["output_spread"])
+                    if distributed.rank() == 0:
+                        self._constant.look(self.iteration, means["output_spread"])
                 if progress is not None:
                     progress(self.iteration, report)
                 if self.watch is not None and settings.validate_every and self.iteration % settings.validate_every == 0:
@@ -242,19 +243,6 @@ class Trainer:
             self.slots.advance(prediction.next_pos, simulator.next_velocity(shown, prediction))
         self.iteration += 1
         return report
-
-    def _tell_if_constant(self, spread: float) -> None:
-        """Say once that nothing is learned any more: a gradient that reaches one constant cannot bring the network back."""
-        if spread < CONSTANT and not self._told_constant:
-            self._told_constant = True
-            distributed.on_main(
-                lambda: say(
-                    f"hood: iteration {self.iteration}: the network gives every vertex the same acceleration, whatever it is "
-                    "shown. The units of its decoder are dead, and nothing is learned any more; begin again with a lower "
-                    f"trainer.learning_rate than {self.settings.learning_rate:g}",
-                    error=True,
-                )
-            )
 
     def averaged(self) -> NetworkStepper:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""

@@ -43,7 +43,6 @@ SHORT = (
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
     Short("^train.*time_scale=0.02", ("trainer.iterations=50",), "a fiftieth of which is one update"),
-    Short("^train.*time_scale=0.133333", ("trainer.iterations=8",), "of which one update is left"),
     Short("^evaluate.*garments_dict", ("num_frames=4", "gap_states=1", "gap_iterations=2"), "the least number of frames"),
     Short(
         "^evaluate(?!.*garments_dict)",

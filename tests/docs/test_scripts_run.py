@@ -55,7 +55,7 @@ RUN = (
     Run(r"events_picture\.py", "", "", (r"rollout\.h5 docs/images/", "long.h5 ")),
     Run(r"extremes\.py", "--side 9 --frames 1", r"\| × 100 \| × 0\.1 \|"),
     Run(r"fabrics\.py", "", r"below_waistband"),
-    Run(r"frame\.py", "--sizes 300 --models small-fine15 --precision fp32 --frames 3", r"\| small-fine15 \| torch \| fp32 \|"),
+    Run(r"frame\.py", "--sizes 300 --models fine15 --precision fp32 --frames 3", r"\| fine15 \| torch \| fp32 \|"),
     Run(r"fuzz\.py", "--count 3", r"\| all \| 3 \|", slow=True),
     Run(r"guard\.py", "--garments tank --motions plie --steppers newton --frames 3", r"alarms 0, repairs 0 of 2"),
     Run(r"half\.py", "--garments tank --frames 12", r"\| tank \|", (r"A B", "A.safetensors B.safetensors")),

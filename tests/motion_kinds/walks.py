@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.files.library import locate
-from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.recording import read_recording
+from hood.assets.motion.skeleton import UP_AXES
 
 COUNT = 60
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 
 class Thing:

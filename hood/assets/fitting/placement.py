@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.garment.binding import closest_points
-from hood.assets.motion import axes
+from hood.assets.motion.skeleton import UP_AXES
 
 #: A garment around the body has its middle vertex nearer to the skin than this [m] ...
 _FARTHEST = 0.35
@@ -25,7 +25,7 @@ _LEAST_ROUND = 0.3
 _LOOKED_AT = 4000
 
 #: Rotations (3, 3) that turn the up axis of a file to y.
-UPWARD = {axis: axes.UP_AXES[axis] for axis in ("y", "z", "x")}
+UPWARD = {axis: UP_AXES[axis] for axis in ("y", "z", "x")}
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ from hood.assets.formats.vertex_files import (
     caches,
     read_point_cache,
 )
-from hood.assets.motion.axes import require_up
 from hood.assets.motion.mesh_sequence import MeshSequence, loop_mesh, resample_mesh, trim_mesh, turn_mesh
 from hood.assets.motion.sequence import rate_of, real_rows
+from hood.assets.motion.skeleton import require_up
 from hood.mesh import topology
 from hood.mesh.editing.repair import sew_moving
 

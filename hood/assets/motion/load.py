@@ -15,10 +15,9 @@ import numpy as np
 from hood.assets.files.library import locate
 from hood.assets.files.said import Doubt
 from hood.assets.motion import sequence_edit as edit
-from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.recording import NUM_BODY_JOINTS, Recording, read_recording
 from hood.assets.motion.sequence import PoseSequence, checked_sequence, resample, still, turn_world
-from hood.assets.motion.skeleton import joints_about_pelvis, some_frames, spread
+from hood.assets.motion.skeleton import UP_AXES, joints_about_pelvis, require_up, some_frames, spread
 
 #: The head is over the feet along an axis where the unit vector between them has this component there, and a body stands
 #: along an axis where that is so in this share of the frames; along that of its layout in the second share.

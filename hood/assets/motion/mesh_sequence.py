@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hood.assets.files.library import SIZE_LIMIT
-from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.sequence import time_stamps
 from hood.assets.motion.sequence_edit import frame_at
+from hood.assets.motion.skeleton import UP_AXES
 
 #: First and last frame of a motion that can be repeated may differ by this share of its size.
 _SEAM = 0.05

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hood.assets.motion.axes import Z_UP_TO_Y_UP
 from hood.assets.motion.recording import NUM_BODY_JOINTS
-from hood.assets.motion.skeleton import from_vectors, slerp
+from hood.assets.motion.skeleton import Z_UP_TO_Y_UP, from_vectors, slerp
 
 __all__ = ["NUM_BODY_JOINTS", "Z_UP_TO_Y_UP", "PoseSequence", "resample", "still", "turn_world"]
 

@@ -27,10 +27,10 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate
 from hood.assets.files.said import Doubt
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind
-from hood.assets.motion.axes import UP_AXES, require_up
 from hood.assets.motion.layouts.people import SeveralPeopleError
 from hood.assets.motion.load import find_bearing, find_up
 from hood.assets.motion.recording import Recording, read_recording
+from hood.assets.motion.skeleton import UP_AXES, require_up
 from hood.cli.inspect import findings
 from hood.cli.inspect.findings import Finding
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion

@@ -43,10 +43,10 @@ from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.assets.garment.record import Fitting, start_fitting
 from hood.assets.motion.animated_mesh import body_kind
-from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import arms_down, holds_pose, read_pose
+from hood.assets.motion.skeleton import UP_AXES
 from hood.cli.prepare.mesh_body import fasten_as_asked, give_room, prepare_for_mesh
 from hood.media.exports.mesh import write_obj
 from hood.mesh.editing.quality import check_triangles

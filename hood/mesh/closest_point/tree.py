@@ -18,7 +18,7 @@ from hood import native
 from hood.mesh.geometry import MOST_CURVATURE, ROUNDS
 from hood.native.arguments import COUNT, POINTER, REAL, fields, num_parts
 from hood.native.build import optional
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
 #: Faces of a leaf, as in the source, and bytes of a line of the cache.

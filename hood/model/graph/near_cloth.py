@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.mesh.topology import Rings, connected_components
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 #: Vertices of one piece of cloth that are nearer at rest than so many radii lie side by side, however fine the mesh is: they
 #: are no layers.

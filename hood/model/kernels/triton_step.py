@@ -23,7 +23,7 @@ from torch import Tensor
 
 from hood.model.graph.builder import EdgeSet, Subset
 from hood.tensors.dense import linear
-from hood.tensors.triton_device import has_triton
+from hood.tensors.precision import has_triton
 
 if TYPE_CHECKING:
     from hood.model.network.message_passing import ProcessorStep
@@ -39,7 +39,7 @@ INPUT_PRECISIONS = ("ieee", "tf32x3", "tf32")
 
 def applies(width: int, dtype: torch.dtype, device: torch.device) -> bool:
     """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, without gradients, float32 or
-    bfloat16, a multiple of 16 up to :data:`WIDEST`, where :func:`hood.tensors.triton_device.has_triton` says so."""
+    bfloat16, a multiple of 16 up to :data:`WIDEST`, where :func:`hood.tensors.precision.has_triton` says so."""
     return not torch.is_grad_enabled() and width % 16 == 0 and width <= WIDEST.get(dtype, 0) and has_triton(device)
 
 

@@ -243,26 +243,21 @@ class MeshGraphNet(nn.Module):
         names = (*self.edge_set_names, *self.world_sets)
         edges = {name: self.edge_encoder(name)(edge_features[name], dtype) for name in names}
         steps = iter(zip(self.schedule, self.steps, strict=True))
-        memory: dict[tuple[str, ...], Tensor] = {}
+        self._sums: dict[tuple[str, ...], Tensor] = {}  # what steps write to; of this evaluation
         raw = nodes.new_empty(0)
         for index, length in enumerate(self.passes):
             if index > 0:
                 assert look is not None, "several passes need someone who looks at what they lead to"
                 nodes, edges = self._see(index, nodes, edges, *look(index - 1, raw))
             for sets, step in islice(steps, length):
-                nodes, edges = self._take(cast(ProcessorStep, step), sets, graph, nodes, edges, memory)
+                nodes, edges = self._take(cast(ProcessorStep, step), sets, graph, nodes, edges)
             decoder = self.decoder if index == 0 else self.late_decoders[index - 1]
             raw = decoder(nodes[: graph.num_cloth].to(node_features.dtype))
+        self._sums = {}
         return raw, nodes, edges
 
     def _take(
-        self,
-        step: ProcessorStep,
-        sets: tuple[str, ...],
-        graph: Graph,
-        nodes: Tensor,
-        edges: Mapping[str, Tensor],
-        memory: dict[tuple[str, ...], Tensor],
+        self, step: ProcessorStep, sets: tuple[str, ...], graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Latents after one processor step on the edge sets ``sets``."""
         inferring = not torch.is_grad_enabled()
@@ -273,7 +268,7 @@ class MeshGraphNet(nn.Module):
                 step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False
             )
             return taken
-        taken = step(nodes, edges, subsets, overwrite, memory) if overwrite else step(nodes, edges, subsets, overwrite)
+        taken = step(nodes, edges, subsets, overwrite, self._sums) if overwrite else step(nodes, edges, subsets)
         return taken
 
     def _see(

@@ -18,7 +18,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import blend_in
 from hood.cloth.state import Obstacle
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 #: Frames posed at once: enough to amortise the call, few enough for short training windows.
 _CHUNK = 16

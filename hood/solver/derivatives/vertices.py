@@ -21,7 +21,7 @@ from hood.energies.term import MATRIX_FORMS, VERTEX_FORMS, Form, having
 from hood.energies.wind import Drag
 from hood.solver.derivatives import compiled_vertices
 from hood.solver.derivatives.compiled_vertices import ContactPass, VertexPass, contact_pass
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from hood.energies.term import Role, having
 from hood.mesh.cloth_proximity import EASED
 from hood.solver.derivatives.self_contact import approached, eased, layers_of, limits
 from hood.solver.derivatives.step_terms import StepTerms
-from hood.tensors.batch import to_device
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget, to_device
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from hood.solver.derivatives.points import PointBlocks, point_blocks
 from hood.solver.derivatives.self_contact import LayerRows, layer_rows
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.sparsity import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
-from hood.tensors.weak_cache import forget
+from hood.tensors.batch import forget
 
 
 class SolverPlan:

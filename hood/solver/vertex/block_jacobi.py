@@ -18,9 +18,9 @@ from hood.solver.derivatives.elements import FaceModel
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.linear import invert_blocks
 from hood.solver.vertex.cg_step import STEPS, PositiveMatrix, global_step
+from hood.tensors.batch import forget
 from hood.tensors.conjugate_gradients import Steps
 from hood.tensors.dense import add_rows
-from hood.tensors.weak_cache import forget
 
 #: Upper triangle of a 3 × 3 block.
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

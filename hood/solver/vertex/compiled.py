@@ -21,8 +21,8 @@ from hood.solver.compiled.system import CompiledScene
 from hood.solver.compiled.tables import build_tables
 from hood.solver.vertex.block_jacobi import LocalTerms, LocalView
 from hood.solver.vertex.cg_step import STEPS
+from hood.tensors.batch import forget
 from hood.tensors.conjugate_gradients import Steps
-from hood.tensors.weak_cache import forget
 
 _POINTER = ctypes.c_void_p
 

@@ -30,6 +30,7 @@ from hood.steppers.static_shapes.problem import (
     step_shape,
     with_fixed_contact,
 )
+from hood.tensors.precision import has_triton
 
 if TYPE_CHECKING:
     from hood.steppers.newton import NewtonStepper
@@ -69,6 +70,9 @@ class CapturedNewton:
                 f"{settings.cg_iterations} whatever a step needs: give at most {MOST} and {MOST_CG}, such as "
                 "solver.max_iterations=5 solver.cg_iterations=75"
             )
+        device = stepper.gravity.device
+        if mode == "compiled" and device.type == "cuda" and not has_triton(device):
+            raise ValueError("step=compiled of the solver needs Triton and a GPU from 2020 on (Ampere); use step=captured")
         self.stepper, self.mode = stepper, mode
         self.gravity, self.config, self.metrics = stepper.gravity, stepper.config, stepper.metrics
         self.solves_to = stepper.solves_to

@@ -18,11 +18,11 @@ from hood.energies.potential import Potential, keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.native import features as native
 from hood.solver.newton import NewtonSettings
-from hood.solver.system.block_cg import block_cg, block_rows
 from hood.solver.system.iterate import rounded
 from hood.solver.system.plan import SolverPlan
 from hood.steppers.static_shapes.newton_pieces import Pieces
 from hood.steppers.static_shapes.problem import problem_from, with_fixed_contact
+from hood.tensors.conjugate_gradients import block_cg, block_rows
 
 
 class NewtonFrame(Pieces):
@@ -53,7 +53,7 @@ class NewtonFrame(Pieces):
         super().__init__(potential, like, plan, settings.cg_iterations, settings.double)
         self._settings, self._given, self._places, self._dense = settings, like, places, dense
         self._folds = keeps_both_sides(potential)
-        self._rows = block_rows(plan.pattern, plan.scene, self._num_scenes)
+        self._rows = block_rows(plan.pattern.cols, plan.pattern.starts, plan.scene, self._num_scenes)
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         now = copy.copy(self)  # pieces hand tensors over as attributes, and those of a trace must not stay

@@ -16,8 +16,8 @@ from hood.assets.body.body import Body
 from hood.assets.files.said import Doubt
 from hood.assets.formats.mesh_file import read_mesh
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
-from hood.assets.motion.axes import UP_AXES
 from hood.assets.motion.mesh_sequence import MeshSequence, resample_mesh
+from hood.assets.motion.skeleton import UP_AXES
 from hood.testing import box, sphere
 
 POINTS, FACES = sphere(1, 0.5)

@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from hood.assets.files.library import locate, names
 from hood.assets.files.said import Doubt
-from hood.assets.motion.axes import UP_AXES, Z_UP_TO_Y_UP
 from hood.assets.motion.load import bearing_notice, find_bearing, head_down_doubt, load_sequence
 from hood.assets.motion.recording import Recording, read_recording
-from hood.assets.motion.skeleton import joints_about_pelvis
+from hood.assets.motion.skeleton import UP_AXES, Z_UP_TO_Y_UP, joints_about_pelvis
 
 
 @pytest.fixture(scope="module")

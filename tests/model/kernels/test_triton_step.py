@@ -19,9 +19,8 @@ from hood.model.graph.builder import EdgeSet, Subset, edge_set
 from hood.model.kernels import triton_step
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
-from hood.tensors import triton_device
-from hood.tensors.precision import products
-from hood.tensors.triton_device import assumed
+from hood.tensors import precision as triton_device
+from hood.tensors.precision import assumed, products
 
 TILE = 32  # of the widest tiles
 BOUND = {torch.float32: 2e-6, torch.bfloat16: 0.015}

@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hood.solver.system import block_cg
 from hood.solver.system.linear import invert_blocks
 from hood.solver.system.sparsity import BlockPattern
-from hood.tensors.triton_device import assumed
+from hood.tensors import conjugate_gradients as block_cg
+from hood.tensors.precision import assumed
 
 #: Rows of the scenes, shift of the second half of the scenes' matrices (negative: indefinite), iterations, number.
 CASES = {
@@ -58,7 +58,7 @@ def system(name: str) -> tuple[Tensor, ...]:
     right = torch.tensor(rng.normal(size=(count, 3)), dtype=dtype)
     scene = torch.as_tensor(np.repeat(np.arange(len(sizes)), sizes))
     tolerance = torch.full((len(sizes),), 1e-2 if name == "solved before" else 1e-6, dtype=dtype)
-    return triples, inverse, right, tolerance, *block_cg.block_rows(pattern, scene, len(sizes))
+    return triples, inverse, right, tolerance, *block_cg.block_rows(pattern.cols, pattern.starts, scene, len(sizes))
 
 
 def solve(name: str) -> tuple[Tensor, Tensor]:
@@ -68,7 +68,7 @@ def solve(name: str) -> tuple[Tensor, Tensor]:
 
 def interpret(tmp_path: Path, what: str, seconds: int) -> dict[str, tuple[Tensor, Tensor]]:
     pytest.importorskip("triton", reason="Triton is built for Linux only")
-    root = str(Path(__file__).parents[3])
+    root = str(Path(__file__).parents[2])
     search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": search}
     command = [sys.executable, __file__, what, str(tmp_path / "results.pt")]

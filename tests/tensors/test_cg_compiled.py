@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 
-from hood.solver.system.block_cg import CHUNK, TILE, WARPS
+from hood.tensors.conjugate_gradients import CHUNK, TILE, WARPS
 from tests.spills import CAPABILITIES, LEAST, spilled
 
 pytest.importorskip("triton", reason="Triton is built for Linux only")
@@ -19,7 +19,7 @@ ARGUMENTS = {
 @pytest.mark.parametrize("capability", CAPABILITIES)
 @pytest.mark.parametrize("real", ["*fp64", "*fp32"])
 def test_registers_suffice(real, capability, tmp_path, monkeypatch):
-    from hood.solver.system import cg_kernels
+    from hood.tensors import cg_kernels
 
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "cache"))
     kernels = {name: getattr(cg_kernels, name) for name in ("begin_pass", "product_pass", "update_pass")}

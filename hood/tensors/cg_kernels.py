@@ -1,4 +1,4 @@
-"""The kernels behind :mod:`hood.solver.system.block_cg`; importing this module needs Triton.
+"""The kernels behind :func:`hood.tensors.conjugate_gradients.block_cg`; importing this module needs Triton.
 
 No annotations from the future here: Triton reads the annotations of a kernel's constants.
 """
