@@ -134,7 +134,7 @@ def _point(folder: Path) -> Point:
         gap_p95=_estimate(groups, partial(np.quantile, q=0.95)),
         strain_p99=_median(frames, "strain_p99"),
         rg=_median(frames, "relative_gradient"),
-        **{key: float(means[key]) for key in ("worn", "L_total", "gradient_norm", "sound")},
+        **{key: math.nan if means[key] is None else float(means[key]) for key in ("worn", "L_total", "gradient_norm", "sound")},
         states=sum(map(len, groups)),
     )
 

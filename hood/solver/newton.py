@@ -276,7 +276,7 @@ def run(system: System, like: Tensor, settings: NewtonSettings, began: float, pr
         moved = system.move(residual, active)
         stuck = [halted or (scene and not went) for halted, scene, went in zip(stuck, active, moved, strict=True)]
         iteration += 1
-    reason = tuple(_reason(*scene, otherwise=why) for scene in zip(finite, wanted, stuck, strict=True))
+    reason = tuple(reason_of(*scene, otherwise=why) for scene in zip(finite, wanted, stuck, strict=True))
     last = history[-1]
     converged = torch.tensor([not left for left in reason], device=like.device)
     pos, acc = system.state()
@@ -288,7 +288,8 @@ def _tensor(like: Tensor, values: list[float]) -> Tensor:
     return like.new_full((1,), values[0]) if len(values) == 1 else like.new_tensor(values)
 
 
-def _reason(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:
+def reason_of(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:
+    """Why the iterations of a scene ended, of :mod:`hood.solver.step_figures`."""
     if not finite:
         return NOT_FINITE
     return CONVERGED if not wanted else STUCK if stuck else otherwise

@@ -174,7 +174,8 @@ def test_published_weights_go_on_as_they_were_trained(tmp_path: Path) -> None:
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"ours\.safetensors: holds a model of .*features=local.*schedule=ours.*not the model asked for.*=small-ours",
+        match=r"small-ours\.safetensors: holds a model of .*features=local.*schedule=ours.*not the model asked for.*"
+        "weights=small-ours",
     ):
         trainer("model=small", "weights=small-ours")
     with pytest.raises(FileNotFoundError, match="did you mean 'quickstart'"):

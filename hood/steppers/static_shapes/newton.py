@@ -3,6 +3,7 @@ number of iterations that is known before, one compiled function that asks nobod
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,8 @@ from hood.cloth.cloth import Cloth
 from hood.energies.potential import keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.vertices import terms_without_form
-from hood.solver.newton import Report, run
-from hood.solver.step_figures import CONVERGED, MOST_ITERATIONS, reason_number
+from hood.solver.newton import Report, reason_of, run
+from hood.solver.step_figures import MOST_ITERATIONS, reason_number
 from hood.solver.system.iterate import rounded
 from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
@@ -154,10 +155,12 @@ class _Frame(_Fixed):
         return int(faces)
 
     def minimize(self, problem: StepProblem, began: float) -> tuple[Tensor, Report]:
-        """Positions (V, 3) at t + 1 of the problem whose step has been taken."""
+        """Positions (V, 3) m at t + 1 of the problem whose step has been taken; its potential is not known, and of conjugate
+        gradients the most that there can have been."""
         settings, (pos, acc, residual) = self._stepper.settings, (value.clone() for value in self._reached)
+        left = [(math.isfinite(value), value > settings.target_rg) for value in residual.tolist()]
+        reason = tuple(reason_of(finite, wanted, False, MOST_ITERATIONS) for finite, wanted in left)
         converged = residual <= settings.target_rg
-        reason = tuple(CONVERGED if done else MOST_ITERATIONS for done in converged.tolist())
         used, phi = settings.max_iterations * settings.cg_iterations, torch.full_like(residual, torch.nan)
         return pos, Report(settings.max_iterations, used, phi, residual, converged, reason, acc)
 

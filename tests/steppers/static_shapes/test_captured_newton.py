@@ -63,6 +63,8 @@ def test_one_plan_serves_a_cloth_and_another_is_made_where_it_must(skirt_scene):
 
 def test_what_has_no_such_form_is_refused(skirt_scene):
     plain, _ = steppers()
+    with pytest.raises(ValueError, match="step=other is none of the solver's; choose plain, fixed or captured or compiled"):
+        CapturedNewton(plain, "other")
     with pytest.raises(ValueError, match="step=captured needs device=cuda"):
         CapturedNewton(plain, "captured")
     with pytest.raises(ValueError, match="solver.linear=direct has no form of fixed shapes"):
