@@ -31,6 +31,7 @@ from hood.steppers.static_shapes.problem import (
     step_shape,
     with_fixed_contact,
 )
+from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import has_triton
 
 if TYPE_CHECKING:
@@ -143,8 +144,10 @@ class _Frame(_Fixed):
 
     def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int) -> None:
         super().__init__(stepper, problem, places)
-        memory, plan = self._inputs.tensors, plan_for(self._known)
-        frame = NewtonFrame(self._potential, self._known, plan, places, stepper.settings, dense=True)
+        memory, given = self._inputs.tensors, (self._potential, self._known, plan_for(self._known), places, stepper.settings)
+        with whole_arrays():
+            NewtonFrame(*given)(*memory)  # what is made once per cloth is made now: a trace has no values for it
+        frame = NewtonFrame(*given, dense=True)
         self._run: Run = torch.compile(trace(frame, memory), fullgraph=True, dynamic=False)
         if memory[0].device.type == "cuda":
             self._run = CudaGraph(self._run, memory)
