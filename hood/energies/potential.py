@@ -223,13 +223,14 @@ def coded_potential(
     )
 
 
-def scale(problem: StepProblem) -> Tensor:
+def scale(problem: StepProblem, longest: float | None = None) -> Tensor:
     """Reference energy e0 = ½ M g² dt² [J] (B,): what free fall over one step is worth, the unit of the gap.
 
-    Standard gravity stands in where the problem has none.
+    Standard gravity stands in where the problem has none. ``longest`` [s]: a longer step counts as one of that length.
     """
     mass = problem.sum_vertices(problem.cloth.mass)
-    return 0.5 * mass * (_gravity_norm(problem) * problem.step.dt.to(mass)) ** 2
+    dt = problem.step.dt.to(mass)
+    return 0.5 * mass * (_gravity_norm(problem) * (dt if longest is None else dt.clamp_max(longest))) ** 2
 
 
 def relative_gradient(problem: StepProblem, gradient: Tensor) -> Tensor:

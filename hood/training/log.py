@@ -74,18 +74,19 @@ class Clock:
         self._away += time.monotonic() - left
 
 
-def relative_loss(problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor) -> Tensor:
+def relative_loss(problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, longest: float | None = None) -> Tensor:
     """(Φ − Φ_fall) / e0 of every scene (B,): how far the step is above free fall, in units of e0.
 
     Φ alone cannot be watched: gravity's zero is arbitrary, so Φ is as often negative as positive. With Φ_fall, inertia plus
     gravity of the acceleration g, the two become ½ Σ m dt² ‖a − g‖² and no term can be negative; garments of any mass and steps
-    of any length are comparable. Cloth at rest has 1, its weight held up, plus what it is stretched and bent.
+    of any length are comparable. Cloth at rest has 1, its weight held up, plus what it is stretched and bent. ``longest``: of
+    :func:`hood.energies.potential.scale`.
     """
     dt = problem.vertex_dt.squeeze(1)
     apart = (acc - problem.gravity.to(acc)).square().sum(dim=1)
     fall = problem.sum_vertices(0.5 * problem.cloth.mass * dt * dt * apart)
     rest = [value for name, value in energies.items() if name not in ("inertia", "gravity")]
-    return sum(rest, start=fall) / scale(problem)
+    return sum(rest, start=fall) / scale(problem, longest)
 
 
 class MetricsLog:

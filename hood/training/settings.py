@@ -5,18 +5,24 @@ Optimisers for networks whose loss is ill-conditioned: orthogonalised momentum f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from hood.energies.potential import scale
+from hood.energies.problem import StepProblem
+from hood.model.features.normalizer import Whitening
 from hood.model.kernels.block import KERNELS
 from hood.model.network.kernel_choice import AUTO
+from hood.model.network.mlp import MLP
 from hood.model.network.model import PRECISIONS
+from hood.scene.scene import RELAXING_DT
 from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
+from hood.training.log import relative_loss
 from hood.training.slots import RELAXED_VELOCITIES
 
 #: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
@@ -27,6 +33,10 @@ _ADAM_RMS = 0.2
 
 #: Names for :func:`make_optimizer`.
 OPTIMIZERS = ("adam", "muon")
+#: What an update is led by, see :class:`TrainerSettings`.
+SIGNALS = ("potential", "scaled", "scaled_by_frame")
+#: Longest step [s] that has its own e0 with ``scaled_by_frame``; the relaxing step has ten times as long.
+FRAME_DT = RELAXING_DT / 10.0
 
 
 def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -> torch.optim.Optimizer:
@@ -38,6 +48,27 @@ def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -
     chosen = {id(p) for p in inner}
     rest = [p for p in simulator.parameters() if id(p) not in chosen]
     return MuonAdam([{"params": inner, "matrices": True}, {"params": rest, "matrices": False}], learning_rate)
+
+
+class Signal:
+    """What an update is led by, a name of :data:`SIGNALS`; see :class:`TrainerSettings`."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._longest = FRAME_DT if name == "scaled_by_frame" else None
+
+    def loss(self, problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, residual: Tensor) -> Tensor:
+        """What is minimised, of every scene (B,), in units of e0: :func:`hood.training.log.relative_loss`."""
+        return relative_loss(problem, energies, acc, self._longest) * self._damping(residual)
+
+    def weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
+        """Factors (B,) on the gradients of the scenes' potentials; ``residual`` (B,) is their rg."""
+        unit = 1.0 if self._name == "potential" else scale(problem, self._longest)
+        return self._damping(residual) / (unit * problem.num_scenes)
+
+    def _damping(self, residual: Tensor) -> Tensor:
+        """How much of a scene (B,) counts: with a scaled signal one that is far from rest less, as far as it is."""
+        return torch.ones_like(residual) if self._name == "potential" else 1.0 / (1.0 + residual / 3.0)
 
 
 class MuonAdam(torch.optim.Optimizer):
@@ -110,12 +141,32 @@ def orthogonal(blocks: Tensor, rounds: int = 5) -> Tensor:
     return x
 
 
+def make_whitening(simulator: NetworkStepper, on: bool, fresh: bool = True) -> Whitening:
+    """For the edge encoders of a model and the relative places among their features.
+
+    Raises:
+        ValueError: the features have no relative places that are normalised by statistics.
+    """
+    places, network = simulator.features.places, simulator.network
+    if on and not (places["mesh"] and simulator.features.edge_normalizer is not None):
+        raise ValueError("trainer.whitening: of all features only paper has relative places with statistics")
+    names = {id(module): name for name, module in network.edge_encoders.named_children()}
+    sets = (*network.edge_set_names, *network.world_sets) if on else ()
+    encoders = {name: names[id(network.edge_encoder(name))] for name in sets}
+    layers = {name: cast(MLP, network.edge_encoders[name]).first for name in encoders.values()}
+    columns = {name: places["coarse" if name.startswith("coarse") else name] for name in sets}
+    return Whitening(layers, encoders, columns, fresh)
+
+
 @dataclass(frozen=True)
 class TrainerSettings:
     """How a model is trained; defaults are the paper's where it speaks and the reference's where it is silent.
 
     ``signal``: ``"potential"`` is the plain mean potential; ``"scaled"`` divides each scene's gradient by its e0 and by
     1 + rg / 3, so that one broken scene does not drown the others.
+    ``"scaled_by_frame"`` gives the relaxing step the e0 of a frame of 1/30 s, a hundredth of its own: the gradients of both
+    kinds of steps are then of one size.
+    ``whitening``: see :class:`hood.model.features.normalizer.Whitening`.
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
     ``by_rollout``: ``horizon`` and ``collision`` count training rollouts, what the released code calls iterations, see
@@ -141,6 +192,7 @@ class TrainerSettings:
     relaxed_velocity: str = "skinned"
     clip_norm: float = 1.0
     signal: str = "potential"
+    whitening: bool = False
     optimizer: str = "adam"
     ema_decay: float = 0.0
     precision: str = "fp32"
@@ -164,8 +216,10 @@ class TrainerSettings:
             raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
         if self.optimizer not in OPTIMIZERS:
             raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
-        if self.signal not in ("potential", "scaled"):
-            raise ValueError(f"trainer.signal {self.signal!r}: give 'potential' or 'scaled'")
+        if self.signal not in SIGNALS:
+            raise ValueError(f"trainer.signal {self.signal!r}: give {' or '.join(map(repr, SIGNALS))}")
+        if self.whitening and self.statistics_iterations == 0:
+            raise ValueError("trainer.whitening needs statistics: give trainer.statistics_iterations of at least 1, say 100")
         if self.relaxed_velocity not in RELAXED_VELOCITIES:
             names = " or ".join(map(repr, RELAXED_VELOCITIES))
             raise ValueError(f"trainer.relaxed_velocity {self.relaxed_velocity!r}: give {names}")

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import say
-from hood.energies.potential import Potential, relative_gradient, scale
+from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
 from hood.model.features.normalizer import RunningNormalizer
@@ -41,11 +41,10 @@ from hood.training.log import (
     Skipped,
     made_behind,
     output_spread,
-    relative_loss,
     told,
 )
 from hood.training.scenes import SceneSampler
-from hood.training.settings import TrainerSettings, make_optimizer
+from hood.training.settings import Signal, TrainerSettings, make_optimizer, make_whitening
 from hood.training.slots import Slots
 from hood.training.watch import ValidationWatch
 
@@ -110,6 +109,9 @@ class Trainer:
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
+        self.signal = Signal(settings.signal)
+        self.whitening = make_whitening(simulator, settings.whitening, fresh=earlier == 0)
+        self.whitening.shared_sum = distributed.all_reduce_sum if ranks > 1 else None
         self.iteration = 0
         self.earlier = earlier
         self.rollbacks = 0
@@ -210,7 +212,7 @@ class Trainer:
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
         if collecting and simulator.output.collects_statistics:
             simulator.output.observe(self.slots.skinned_accelerations())
-        with torch.set_grad_enabled(not collecting):
+        with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
             prediction = (simulator if collecting else self.model)(shown, prepared, clock)
         next_pos = prediction.next_pos.detach()
         acc = prediction.acc.detach() if shown is problem else problem.acceleration(next_pos)
@@ -223,17 +225,17 @@ class Trainer:
         report = {name: float(value.mean()) for name, value in energies.items()}
         report |= {
             "total": sum(report.values()),
-            "loss": float((relative_loss(problem, energies, acc) * self._damping(residual)).mean()),
+            "loss": float(self.signal.loss(problem, energies, acc, residual).mean()),
             "relative_gradient": float(residual.median()),
             "horizon": float(settings.horizon(count)),
             "output_spread": output_spread(prediction.acc.detach(), cloth.free),
         }
         if not collecting:
-            weight = self._weight(problem, residual)
+            weight = self.signal.weight(problem, residual)
             # The analytic gradient is injected at the output: no graph through the energies is kept.
             surrogate = (prediction.next_pos * (gradient * weight[cloth.vertex_scene].unsqueeze(1))).sum()
             for pos, force in prediction.early:  # every pass answers for where it leads itself
-                weight = self._weight(problem, relative_gradient(problem, force))
+                weight = self.signal.weight(problem, relative_gradient(problem, force))
                 surrogate = surrogate - (pos * (force * weight[cloth.vertex_scene].unsqueeze(1))).sum()
             if self.model is not simulator:
                 # A share without body edges leaves their networks out; all processes must reduce the same parameters.
@@ -270,6 +272,7 @@ class Trainer:
             "simulator": self.simulator.state_dict(),
             "average": self._average,
             "optimizer": self.optimizer.state_dict(),
+            "whitening": self.whitening.state_dict() if self.settings.whitening else None,
             "slots": slots,
             "rng": generators,
             "window": distributed.gather(self._window.state_dict()),
@@ -294,6 +297,12 @@ class Trainer:
             raise ValueError(f"{path}: trained with model {state['model']}, this run has {self.simulator.config}")
         if state["seed"] != self.seed:
             raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
+        white = state.get("whitening") is not None
+        if white != self.settings.whitening:
+            raise ValueError(
+                f"{path}: the optimiser is of a training with trainer.whitening={str(white).lower()}; pass "
+                f"trainer.whitening={str(white).lower()} to resume it"
+            )
         if len(state["slots"]) != self.slots.num_slots:
             if self.settings.max_vertices is None:
                 raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
@@ -342,6 +351,7 @@ class Trainer:
         for name, mean in self._average.items():
             mean.copy_(state["average"][name])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.whitening.load_state_dict(state.get("whitening"))
         self.iteration = int(state["iteration"])
         self._skips.made = made_behind(state)
 
@@ -402,14 +412,6 @@ class Trainer:
             header = {"iteration": self._iterations_in_all, "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
-    def _damping(self, residual: Tensor) -> Tensor:
-        """How much of a scene (B,) counts: with the scaled signal one that is far from rest less, as far as it is."""
-        return torch.ones_like(residual) if self.settings.signal == "potential" else 1.0 / (1.0 + residual / 3.0)
-
-    def _weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
-        unit = 1.0 if self.settings.signal == "potential" else scale(problem)
-        return self._damping(residual) / (unit * problem.num_scenes)
-
     def _optimise(self, surrogate: Tensor, energies: Mapping[str, float]) -> dict[str, float]:
         settings, finite = self.settings, math.isfinite(sum(energies.values()))
         factor = settings.schedule(self.iteration, settings.iterations)
@@ -419,12 +421,13 @@ class Trainer:
         with timed(self.stopwatch, "backward"):
             surrogate.backward()
         with timed(self.stopwatch, "optimiser"):
+            self.whitening.pull()
             # The norm before it is shortened, which also tells infinite gradients.
             norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
             if distributed.any_rank(not (finite and math.isfinite(norm))):
                 self._skips.skip(self.iteration + 1, energies, norm)
             else:
-                self.optimizer.step()
+                self.whitening.push(self.optimizer)
                 self._update_average()
                 self._skips.make()
         return {

@@ -40,6 +40,7 @@ VARIANTS: dict[str, tuple[dict, TrainerSettings]] = {
     "physical": ({"features": "physical", "output": "velocity_base", "output_init": 0.1}, SETTINGS),
     # Running statistics of nodes, edges, body edges and outputs, two garments of different size.
     "paper": ({"features": "paper", "output": "acceleration"}, replace(SETTINGS, signal="potential")),
+    "white": ({"features": "paper", "output": "acceleration"}, replace(SETTINGS, signal="scaled_by_frame", whitening=True)),
 }
 _UPDATES = 6
 
@@ -99,7 +100,9 @@ def test_two_ranks_train_what_one_process_trains(variant: str, tmp_path: Path) -
         kind = "statistics" if "normalizer" in name else "weights"
         worst[kind] = max(worst.get(kind, 0.0), error)
     print(f"{variant}: largest differences {worst}")
-    assert all(error <= 1e-6 for error in worst.values()), worst
+    # Steps in white coordinates are up to 1/0.02 times as long in those of the weights.
+    limit = {"weights": 1e-5} if variant == "white" else {}
+    assert all(error <= limit.get(name, 1e-6) for name, error in worst.items()), worst
 
 
 def train_half(target: Path) -> None:

@@ -153,6 +153,39 @@ def test_the_loss_that_is_reported_is_the_one_that_is_trained(tmp_path: Path, sa
     assert scaled["loss"] == pytest.approx(plain["loss"] / (1.0 + scaled["relative_gradient"] / 3.0), rel=1e-5)
 
 
+def test_relaxing_steps_count_as_frames_with_the_signal_by_frame(tmp_path: Path, sampler: SceneSampler) -> None:
+    """A relaxing step is ten times as long as a frame, and its e0 a hundred times that of one."""
+    settings = replace(SETTINGS, batch_size=1, clip_norm=1e9, learning_rate=1e-12)
+    reports = {}
+    for signal in ("scaled", "scaled_by_frame"):
+        trainer = make(tmp_path / signal, sampler, settings=replace(settings, signal=signal))
+        reports[signal] = [trainer.update() for _ in range(2)]  # the relaxing step, and a frame
+    for name in ("loss", "parameter_gradient_norm"):
+        relaxing, frame = ([report[name] for report in reports[signal]] for signal in ("scaled", "scaled_by_frame"))
+        assert frame[0] == pytest.approx(100.0 * relaxing[0], rel=1e-4)
+        assert frame[1] == pytest.approx(relaxing[1], rel=1e-4)
+
+
+def test_whitening_is_of_all_encoders_of_edges_and_of_places_alone(tmp_path: Path, sampler: SceneSampler) -> None:
+    settings = replace(SETTINGS, whitening=True, learning_rate=1e-3)
+    trainer, plain = make(tmp_path / "a", sampler, PAPER, settings), make(tmp_path / "b", sampler, PAPER)
+    for _ in range(4):
+        trainer.update(), plain.update()
+    assert not trainer.whitening.state_dict()["bases"]  # statistics are still collected
+    trainer.update(), plain.update()
+    bases = trainer.whitening.state_dict()["bases"]
+    assert {name: len(basis) for name, basis in bases.items()} == {"mesh": 9, "coarse0": 9, "body": 9}
+    first, other = (one.simulator.network.edge_encoders["mesh"].first.weight for one in (trainer, plain))
+    assert float((first[:, :8] - other[:, :8]).detach().abs().max()) > 0.1
+    # One update of Adam: the same length in both.
+    torch.testing.assert_close(first[:, 8:], other[:, 8:], atol=2.1e-3, rtol=0)
+
+
+def test_whitening_of_features_without_places_is_refused(tmp_path: Path, sampler: SceneSampler) -> None:
+    with pytest.raises(ValueError, match="trainer.whitening: of all features only paper"):
+        make(tmp_path, sampler, PHYSICAL, replace(SETTINGS, whitening=True))
+
+
 def test_a_network_whose_units_died_is_told_once(
     tmp_path: Path, sampler: SceneSampler, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -195,6 +228,7 @@ VARIANTS = {
     "passes": (PASSES, {"optimizer": "muon"}),
     "bf16": (PHYSICAL, {"precision": "bf16", "ema_decay": 0.0}),
     "edges": (PHYSICAL | {"output": "edges"}, {}),
+    "white": (PAPER, {"signal": "scaled_by_frame", "whitening": True}),
 }
 
 
@@ -327,10 +361,21 @@ def test_checkpoints_of_other_runs_are_refused(
     assert_same(before, dict(trainer.simulator.state_dict()))
 
 
+def test_a_training_without_whitening_does_not_go_on_with_it(tmp_path: Path, sampler: SceneSampler) -> None:
+    """Its optimiser's moments are of other coordinates; the other way round those are not plain."""
+    white = replace(SETTINGS, whitening=True)
+    for name, settings, other in (("plain", SETTINGS, white), ("white", white, SETTINGS)):
+        make(tmp_path / name, sampler, PAPER, replace(settings, iterations=5)).run()
+        trainer = make(tmp_path / name, sampler, PAPER, other)
+        with pytest.raises(ValueError, match=f"pass trainer.whitening={str(settings.whitening).lower()} to resume it"):
+            trainer.resume(trainer.checkpoint_path)
+
+
 @pytest.mark.parametrize(
     "options, word",
     [
         ({"signal": "plain"}, "trainer.signal"),
+        ({"whitening": True, "statistics_iterations": 0}, "trainer.whitening needs statistics"),
         ({"precision": "fp16"}, "trainer.precision"),
         ({"kernels": "fast"}, "trainer.kernels"),
         ({"iterations": 0}, "trainer.iterations"),

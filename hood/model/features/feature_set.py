@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import torch
@@ -79,6 +80,12 @@ class FeatureSet(nn.Module):
         """Widths by edge set as the network takes them."""
         widths = {"mesh": _width(self.edge), "coarse": _width(self.edge), BODY: _width(self.body_edge)}
         return widths | {LAYERS: _width(self.layer_edge)} if len(self.layer_edge) else widths
+
+    @property
+    def places(self) -> dict[str, int]:
+        """How many columns, the first of :attr:`edge_widths`, are relative places; by the same names."""
+        lists = {"mesh": self.edge, "coarse": self.edge, BODY: self.body_edge, LAYERS: self.layer_edge}
+        return {name: _width(takewhile(lambda group: bool(group.places), groups)) for name, groups in lists.items()}
 
     def forward(self, inputs: Inputs, columns: Columns | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Node features (V + W_active, node_width) and edge features by set, rows as in the graph; the columns by torch if not

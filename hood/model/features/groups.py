@@ -54,6 +54,7 @@ class EdgeGroup(nn.Module):
 
     width: int
     normalized = True
+    places = False  # whether these are relative places and their lengths, which go together
     of = "edges"  # whose columns these are: of edges (of the cloth), body_edges or layer_edges
     needs_contact = needs_base = needs_residual = needs_feedback = needs_global_step = False  # as of a NodeGroup
 
@@ -199,7 +200,7 @@ def _log_unit(value: Tensor, name: str) -> Tensor:
 class CurrentRelative(EdgeGroup):
     """Relative position at t and its norm [m]."""
 
-    width = 4
+    width, places = 4, True
 
     def forward(self, inputs: Inputs) -> Tensor:
         return torch.cat(self.columns(inputs), dim=1)
@@ -212,7 +213,7 @@ class CurrentRelative(EdgeGroup):
 class RestRelative(EdgeGroup):
     """Relative rest position and its norm [m]."""
 
-    width = 4
+    width, places = 4, True
 
     def forward(self, inputs: Inputs) -> Tensor:
         return inputs.edges.once("rest", lambda: with_norm(cloth_difference(inputs.cloth.rest_pos, inputs)))
@@ -240,7 +241,7 @@ class EdgeMaterial(EdgeGroup):
 class BodyRelative(EdgeGroup):
     """Relative position and norm [m] between the cloth at t and the body at t, or at t + 1 with ``body="next"``."""
 
-    width = 4
+    width, places = 4, True
     of = "body_edges"
 
     def __init__(self, body: str = "current") -> None:
@@ -268,7 +269,7 @@ class BodyTimestep(EdgeGroup):
 class LayerRelative(EdgeGroup):
     """Relative position and norm [m] between layers of cloth at t, or where they go on to with ``moved``: at x + dt v."""
 
-    width = 4
+    width, places = 4, True
     of = "layer_edges"
 
     def __init__(self, moved: bool = False) -> None:

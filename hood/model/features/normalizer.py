@@ -1,11 +1,18 @@
-"""Normalisation of features and outputs: running statistics (the paper) or fixed physical scales."""
+"""Normalisation of features and outputs: running statistics (the paper) or fixed physical scales.
+
+Training of layers as if the features they see were uncorrelated.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
+
+#: What white columns are divided by at least, in units of the normalised features.
+_LEAST_SPREAD = 2e-2
 
 
 class RunningNormalizer(nn.Module):
@@ -164,3 +171,109 @@ class FixedScale(nn.Module):
 
     def _divisor(self, like: Tensor) -> Tensor | float:
         return self.scale.to(like) if self._number is None else self._number
+
+
+class Whitening:
+    """Updates of first layers in coordinates in which columns of what they see are uncorrelated and of unit size.
+
+    The length of an edge and its rest length are nearly one number: what tells of strain is a few hundredths of either. Of
+    white columns a layer learns alike. The network stays what it is: with W and b of a layer side by side (W, b) = A Q, and the
+    optimiser moves A. Q is made of the moments that were counted before; of columns that are left out, and of layers that saw
+    fewer rows than columns, the updates are the optimiser's own.
+
+    Args:
+        layers: by name; none of them leaves all updates as they are.
+        seen_by: the layer that sees the rows of a set, by the set's name.
+        columns: how many columns of a set are to be white, the first ones.
+        fresh: the layers are not trained yet: what was drawn for (W, b) becomes A.
+    """
+
+    def __init__(
+        self, layers: Mapping[str, nn.Linear], seen_by: Mapping[str, str], columns: Mapping[str, int], fresh: bool = True
+    ) -> None:
+        self._layers, self._seen_by, self._columns, self._fresh = layers, seen_by, columns, fresh
+        self._moments: dict[str, Tensor] = {}  # by layer, (n + 1, n + 1): sums of the products of columns and a one
+        self._bases: dict[str, Tensor] = {}  # by layer, (n + 1, n + 1): Q
+        self.shared_sum: Callable[[Tensor], Tensor] | None = None  # as of a RunningNormalizer
+
+    @contextmanager
+    def around(self, network: nn.Module, collecting: bool) -> Iterator[None]:
+        """Around an evaluation of the network that takes tables by set as its third argument; counts them while ``collecting``
+        and makes the bases before the first evaluation without."""
+        if not (self._layers and collecting):
+            if self._layers and not self._bases:
+                self._settle()
+            yield
+            return
+        handle = network.register_forward_pre_hook(lambda _, given: self.count(given[2]))
+        try:
+            yield
+        finally:
+            handle.remove()
+
+    def count(self, tables: Mapping[str, Tensor]) -> None:
+        """Tables (N, ≥ columns) by set."""
+        for name, layer in self._seen_by.items():
+            seen = tables[name].detach()[:, : self._columns[name]].double()
+            seen = torch.cat([seen, seen.new_ones(len(seen), 1)], dim=1)
+            moments = seen.mT @ seen
+            self._moments[layer] = self._moments[layer] + moments if layer in self._moments else moments
+
+    @torch.no_grad()
+    def pull(self) -> None:
+        """Turn the gradients of (W, b) into those of A."""
+        for name, basis in self._bases.items():
+            weight, bias = self._layers[name].weight.grad, self._layers[name].bias.grad
+            if weight is not None and bias is not None:
+                _put(weight, bias, _side_by_side(weight, bias, basis) @ basis.mT)
+
+    @torch.no_grad()
+    def push(self, optimizer: torch.optim.Optimizer) -> None:
+        """One step of the optimiser, whose change of (W, b) is taken as that of A."""
+        before = {name: _side_by_side(*_both(self._layers[name]), basis) for name, basis in self._bases.items()}
+        optimizer.step()
+        for name, basis in self._bases.items():
+            weight, bias = _both(self._layers[name])
+            change = _side_by_side(weight, bias, basis) - before[name]
+            _put(weight, bias, before[name] + change @ basis)
+
+    def state_dict(self) -> dict[str, dict[str, Tensor]]:
+        """What was counted, and what was made of it."""
+        return {"moments": dict(self._moments), "bases": dict(self._bases)}
+
+    def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]] | None) -> None:
+        """Go on from :meth:`state_dict`; None is of a training without whitening."""
+        if state is not None:
+            self._moments, self._bases = dict(state["moments"]), dict(state["bases"])
+
+    @torch.no_grad()
+    def _settle(self) -> None:
+        for name, moments in sorted(self._moments.items()):
+            if self.shared_sum is not None:
+                moments = self.shared_sum(moments.clone())
+            rows = moments[-1, -1]
+            if rows < len(moments):
+                continue
+            mean = moments[-1, :-1] / rows
+            values, directions = torch.linalg.eigh(moments[:-1, :-1] / rows - torch.outer(mean, mean))
+            whiten = directions @ torch.diag(1.0 / values.clamp_min(_LEAST_SPREAD**2).sqrt()) @ directions.mT
+            basis = torch.eye(len(moments), dtype=moments.dtype, device=moments.device)
+            basis[:-1, :-1], basis[:-1, -1] = whiten, -whiten @ mean
+            self._bases[name] = basis
+            if self._fresh:
+                weight, bias = _both(self._layers[name])
+                _put(weight, bias, _side_by_side(weight, bias, basis) @ basis)
+
+
+def _both(layer: nn.Linear) -> tuple[Tensor, Tensor]:
+    return layer.weight, layer.bias
+
+
+def _side_by_side(weight: Tensor, bias: Tensor, basis: Tensor) -> Tensor:
+    """(d, n + 1): the columns that a basis is of, and the bias."""
+    return torch.cat([weight[:, : len(basis) - 1], bias.unsqueeze(1)], dim=1).to(basis)
+
+
+def _put(weight: Tensor, bias: Tensor, values: Tensor) -> None:
+    weight[:, : values.shape[1] - 1] = values[:, :-1].to(weight)
+    bias.copy_(values[:, -1])

@@ -1,9 +1,11 @@
 """Running statistics against their definition."""
 
+import copy
+
 import pytest
 import torch
 
-from hood.model.features.normalizer import FixedScale, RunningNormalizer
+from hood.model.features.normalizer import FixedScale, RunningNormalizer, Whitening
 
 
 def calls(count: int = 7) -> list[torch.Tensor]:
@@ -140,3 +142,71 @@ def test_divisor_floor_divides_constant_channels_too():
     torch.testing.assert_close(normalizer.eval()(torch.tensor([[3.0, 6.0]])), expected)
     with pytest.raises(ValueError, match="divisor_floor"):
         RunningNormalizer(2, divisor_floor=0.0)
+
+
+def like_an_edge(count: int, seed: int) -> torch.Tensor:
+    """Two columns that are nearly one, and a third that is not to be white."""
+    rows = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    return torch.cat([rows[:, :1] + 0.5, rows[:, :1] + 0.5 + 0.05 * rows[:, 1:2], rows[:, 2:]], dim=1)
+
+
+@pytest.mark.parametrize("optimizer", [torch.optim.Adam, torch.optim.SGD])
+def test_a_layer_is_trained_as_if_it_saw_white_columns(optimizer):
+    """Another layer sees them: u = T (x - mean), its weights begin where those of the first did."""
+    torch.manual_seed(0)
+    layer = torch.nn.Linear(3, 4)
+    twin = copy.deepcopy(layer)
+    seen, network = like_an_edge(1000, 1), torch.nn.Sequential(layer)
+    whitening = Whitening({"mesh": layer}, {"mesh": "mesh"}, {"mesh": 2})
+    whitening.count({"mesh": seen})
+    with whitening.around(network, collecting=False):
+        pass
+    places = seen[:, :2].double()
+    values, directions = torch.linalg.eigh(torch.cov(places.T, correction=0))
+    assert float(values[0].sqrt()) < 0.05 < 1.0 < float(values[1].sqrt())
+    whiten = directions @ torch.diag(values.rsqrt()) @ directions.T
+
+    def white(x):
+        return torch.cat([(x[:, :2].double() - places.mean(dim=0)) @ whiten, x[:, 2:]], dim=1).float()
+
+    torch.testing.assert_close(torch.cov(white(seen)[:, :2].T, correction=0), torch.eye(2), atol=1e-5, rtol=0)
+    first, second = optimizer(layer.parameters(), 0.01), optimizer(twin.parameters(), 0.01)
+    for step in range(30):
+        x = like_an_edge(50, 10 + step)
+        target = (x[:, 1:2] - x[:, :1]) * torch.tensor([20.0, -10.0, 5.0, 1.0])
+        for to, given in ((layer, x), (twin, white(x))):
+            to.zero_grad()
+            (to(given) - target).square().mean().backward()
+        whitening.pull()
+        whitening.push(first)
+        second.step()
+        torch.testing.assert_close(layer(x), twin(white(x)), atol=2e-5, rtol=0)
+
+
+def test_trained_layers_are_left_as_they_are_until_their_first_update():
+    torch.manual_seed(0)
+    layer = torch.nn.Linear(3, 4)
+    before = copy.deepcopy(layer.state_dict())
+    whitening = Whitening({"mesh": layer}, {"mesh": "mesh"}, {"mesh": 2}, fresh=False)
+    whitening.count({"mesh": like_an_edge(1000, 1)})
+    with whitening.around(layer, collecting=False):
+        pass
+    assert all(torch.equal(value, before[name]) for name, value in layer.state_dict().items())
+    assert set(whitening.state_dict()["bases"]) == {"mesh"}
+
+
+def test_fewer_rows_than_columns_leave_the_updates_as_they_are():
+    layers = {name: torch.nn.Linear(3, 4) for name in ("mesh", "body")}
+    whitening = Whitening(layers, {"mesh": "mesh", "body": "body"}, {"mesh": 2, "body": 2})
+    whitening.count({"mesh": like_an_edge(100, 1), "body": torch.zeros(0, 3)})
+    with whitening.around(layers["mesh"], collecting=False):
+        pass
+    assert set(whitening.state_dict()["bases"]) == {"mesh"}
+
+
+def test_nothing_is_counted_after_an_evaluation_that_failed():
+    network = torch.nn.Linear(3, 4)
+    whitening = Whitening({"mesh": network}, {"mesh": "mesh"}, {"mesh": 2})
+    with pytest.raises(RuntimeError, match="no"), whitening.around(network, collecting=True):
+        raise RuntimeError("no")
+    assert not network._forward_pre_hooks
