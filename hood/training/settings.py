@@ -99,36 +99,38 @@ class MuonAdam(torch.optim.Optimizer):
                 self._adam(group, present)
 
     def _orthogonal(self, group: dict[str, Any], params: list[Tensor]) -> None:
-        momentum = group["momentum"]
-        pieces: list[Tensor] = []
-        for p in params:
-            state = self.state[p]
-            if not state:
-                state["momentum"] = torch.zeros_like(p)
-            assert p.grad is not None
-            state["momentum"].lerp_(p.grad, 1.0 - momentum)
-            pieces += torch.lerp(p.grad, state["momentum"], momentum).split(p.shape[0], dim=1)
-        if not pieces:
+        if not params:
             return
-        blocks = orthogonal(torch.stack(pieces))
-        step = -group["lr"] * _ADAM_RMS * blocks.shape[1] ** 0.5
-        place = 0
-        for p in params:
-            count = p.shape[1] // p.shape[0]
-            p.add_(torch.cat(blocks[place : place + count].unbind(), dim=1), alpha=step)
-            place += count
+        momentum, grads = group["momentum"], [cast(Tensor, p.grad) for p in params]
+        kept = self._kept("momentum", params)
+        torch._foreach_lerp_(kept, grads, 1.0 - momentum)
+        ahead = torch._foreach_lerp(grads, kept, momentum)
+        blocks = orthogonal(torch.stack([block for one in ahead for block in one.split(one.shape[0], dim=1)]))
+        places = [block for p in params for block in p.split(p.shape[0], dim=1)]
+        torch._foreach_add_(places, list(blocks.unbind()), alpha=-group["lr"] * _ADAM_RMS * blocks.shape[1] ** 0.5)
 
     def _adam(self, group: dict[str, Any], params: list[Tensor]) -> None:
-        first, second = group["betas"]
+        if not params:
+            return
+        (first, second), grads = group["betas"], [cast(Tensor, p.grad) for p in params]
+        means, squares = self._kept("first", params), self._kept("second", params)
         for p in params:
-            state = self.state[p]
-            if not state:
-                state["first"], state["second"], state["step"] = torch.zeros_like(p), torch.zeros_like(p), 0
-            state["step"] += 1
-            state["first"].lerp_(p.grad, 1.0 - first)
-            state["second"].mul_(second).addcmul_(p.grad, p.grad, value=1.0 - second)
-            root = (state["second"] / (1.0 - second ** state["step"])).sqrt_().add_(group["eps"])
-            p.addcdiv_(state["first"], root, value=-group["lr"] / (1.0 - first ** state["step"]))
+            self.state[p]["step"] = self.state[p].get("step", 0) + 1
+        counts = [self.state[p]["step"] for p in params]
+        torch._foreach_lerp_(means, grads, 1.0 - first)
+        torch._foreach_mul_(squares, second)
+        torch._foreach_addcmul_(squares, grads, grads, value=1.0 - second)
+        roots = torch._foreach_div(squares, [1.0 - second**count for count in counts])
+        torch._foreach_sqrt_(roots)
+        torch._foreach_add_(roots, group["eps"])
+        torch._foreach_addcdiv_(params, means, roots, [-group["lr"] / (1.0 - first**count) for count in counts])
+
+    def _kept(self, name: str, params: list[Tensor]) -> list[Tensor]:
+        """What is kept of every parameter under a name, zero at first."""
+        for p in params:
+            if name not in self.state[p]:
+                self.state[p][name] = torch.zeros_like(p)
+        return [self.state[p][name] for p in params]
 
 
 def orthogonal(blocks: Tensor, rounds: int = 5) -> Tensor:
