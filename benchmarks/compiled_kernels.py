@@ -6,18 +6,23 @@
 
 The compiler's scheduler decides on a CPU what is one kernel, and nothing is generated or run. A GPU's scheduler decides alike,
 but for concatenations: it makes one kernel of up to eight arrays, and so does it here. Printed are the operations of the traced
-frame, the kernels by kind, and their sum; operators of our own count as the kernels that they have.
+frame, the kernels by kind, their sum, the bytes that they read and write, and the time of an H100 by these counts
+(benchmarks/roofline.py). Operators of our own count as the kernels that they have; arrays whose rows they gather are read once,
+from then on they are in the cache, and all of their matrices meet as many rows as their largest array has.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections import Counter
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from gpu import SOLVER, Bench, frame_settings
+from roofline import DATA_SHEETS
 
 from hood.assets.files.library import locate
 from hood.model.graph.static_shapes import lay_out
@@ -31,8 +36,11 @@ from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import assumed
 
-#: Kernels of an operator that has not one.
-KERNELS = {"torch.ops.hood.step_edges.default": 2, "torch.ops.hood.block_cg.default": 1 + 2 * frame_settings().cg_iterations}
+#: Kernels of an operator that has not one, and how often they read and write what the operator is given.
+STEPS = frame_settings().cg_iterations
+KERNELS = {"torch.ops.hood.step_edges.default": (2, 1), "torch.ops.hood.block_cg.default": (1 + 2 * STEPS, STEPS)}
+#: No matrix of a network has more rows or columns.
+WIDEST = 512
 #: Places for body faces.
 PLACES = 64
 #: Nodes of the schedule that start nothing.
@@ -43,19 +51,48 @@ class _Counted(Exception):
     """There is nothing left to know."""
 
 
-def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Counter[str]:
-    """Kernels by kind; those that the compiler writes itself are ``fused``."""
+@dataclass
+class Frame:
+    """What a frame asks of a GPU."""
+
+    kernels: Counter[str] = field(default_factory=Counter)  # by kind; those that the compiler writes itself are ``fused``
+    moved: Counter[str] = field(default_factory=Counter)  # bytes by kind
+    seconds: float = 0.0  # of an H100
+
+    def add(self, node: Any) -> None:
+        kind, device = type(node).__name__, DATA_SHEETS["h100"]
+        if kind == "NopKernelSchedulerNode":
+            return
+        name = "fused"
+        if kind == "ExternKernelSchedulerNode":
+            name = str(getattr(node.node, "python_kernel_name", None) or type(node.node).__name__)
+        if name in NOTHING:
+            return
+        number, times = KERNELS.get(name, (1, 1))
+        moved = int(node.get_read_write_buffers_sizes()) * times
+        own = name.startswith("torch.ops.hood.") and times == 1
+        work = matrices(node.node) if own else int(node.estimate_flops() or 0)
+        self.kernels[name] += number
+        self.moved[name] += moved
+        self.seconds += max(number * device.replay, moved / device.bandwidth, work / device.matmul["fp32"])
+
+
+def matrices(operator: Any) -> int:
+    """Floating-point operations of an operator's matrices, as if all of them met every row of its largest array."""
+    shapes = [tuple(int(size) for size in given.get_size()) for given in operator.inputs]
+    weights = sum(math.prod(shape) for shape in shapes if len(shape) == 2 and max(shape) <= WIDEST)
+    return 2 * max(shape[0] for shape in shapes if shape) * weights
+
+
+def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Frame:
+    """What the compiler makes of a traced frame."""
     from torch._inductor.scheduler import Scheduler
 
-    found: Counter[str] = Counter()
+    found = Frame()
 
     def count(self: Any) -> None:
         for node in self.nodes:
-            kind = type(node).__name__
-            if kind == "ExternKernelSchedulerNode":
-                found[str(getattr(node.node, "python_kernel_name", None) or type(node.node).__name__)] += 1
-            elif kind != "NopKernelSchedulerNode":
-                found["fused"] += 1
+            found.add(node)
         raise _Counted
 
     Scheduler.codegen = count  # type: ignore[method-assign]
@@ -63,11 +100,9 @@ def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Counte
     try:
         torch.compile(module, fullgraph=True, dynamic=False)(*inputs)
     except Exception as error:
-        if not found:
+        if not found.kernels:
             raise RuntimeError("the compiler did not come as far as its schedule") from error
-    for name in NOTHING:
-        found.pop(name, None)
-    return Counter({name: number * KERNELS.get(name, 1) for name, number in found.items()})
+    return found
 
 
 def _concatenate_as_on_a_gpu() -> None:
@@ -89,10 +124,12 @@ def main(model: str, size: int) -> None:
     function, inputs = newton_frame(bench) if model == SOLVER else network_frame(bench, model)
     with assumed():
         module = trace(function, inputs)
-        kernels = schedule(module, inputs)
+        frame = schedule(module, inputs)
+    kernels = frame.kernels
     print(f"{model}, {size:,} vertices: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels")
+    print(f"{sum(frame.moved.values()) / 1e9:.2f} GB, {1e3 * frame.seconds:.2f} ms on an H100 (computed)")
     for name, number in kernels.most_common():
-        print(f"{number:6,}  {name}")
+        print(f"{number:6,}  {frame.moved[name] / 1e9:6.2f} GB  {name}")
 
 
 def newton_frame(bench: Bench) -> tuple[Any, list[torch.Tensor]]:

@@ -42,6 +42,10 @@ SHORT = (
     Short("^rollout.*=dress_12k", ("garment=dress",), "another resolution of the same garment"),
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
+    Short(
+        "^train.*paper_fast.*time_scale=0.13", ("trainer.iterations=15", "trainer.statistics_iterations=1"),
+        "one update after one that counts features",
+    ),
     Short("^train.*time_scale=0.02", ("trainer.iterations=50",), "a fiftieth of which is one update"),
     Short("^evaluate.*garments_dict", ("num_frames=4", "gap_states=1", "gap_iterations=2"), "the least number of frames"),
     Short(
