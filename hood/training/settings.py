@@ -36,7 +36,7 @@ OPTIMIZERS = ("adam", "muon")
 #: What an update is led by, see :class:`TrainerSettings`.
 SIGNALS = ("potential", "scaled", "scaled_by_frame")
 #: Longest step [s] that has its own e0 with ``scaled_by_frame``; the relaxing step has ten times as long.
-FRAME_DT = RELAXING_DT / 10.0
+_FRAME_DT = RELAXING_DT / 10.0
 
 
 def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -> torch.optim.Optimizer:
@@ -55,7 +55,7 @@ class Signal:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._longest = FRAME_DT if name == "scaled_by_frame" else None
+        self._longest = _FRAME_DT if name == "scaled_by_frame" else None
 
     def loss(self, problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, residual: Tensor) -> Tensor:
         """What is minimised, of every scene (B,), in units of e0: :func:`hood.training.log.relative_loss`."""

@@ -101,7 +101,9 @@ class Trainer:
         shares = (rank, ranks, settings.max_vertices, settings.workers, settings.by_rollout, settings.relaxed_velocity)
         self.slots = Slots(sampler, simulator, settings.batch_size, seed, longest, *shares)
         self.model: torch.nn.Module = simulator
+        self.signal, self.whitening = Signal(settings.signal), make_whitening(simulator, settings.whitening, earlier == 0)
         if ranks > 1:
+            self.whitening.shared_sum = distributed.all_reduce_sum
             # Statistics are kept equal by their own sums; scenes are drawn by slot, so only other draws need a generator each.
             self.model = distributed.averaging(simulator)
             torch.manual_seed(seed + 7919 * rank)
@@ -109,12 +111,7 @@ class Trainer:
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
-        self.signal = Signal(settings.signal)
-        self.whitening = make_whitening(simulator, settings.whitening, fresh=earlier == 0)
-        self.whitening.shared_sum = distributed.all_reduce_sum if ranks > 1 else None
-        self.iteration = 0
-        self.earlier = earlier
-        self.rollbacks = 0
+        self.iteration, self.earlier, self.rollbacks = 0, earlier, 0
         self.best = math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: _Observer | None = None
