@@ -9,7 +9,7 @@ on to a relative gradient of 1e-3, at most 60 iterations. Printed are, for relax
 
 - distance [mm] of the vertices to that minimum (medians over steps of the median and of the 99th percentile), for zero output
   and for the network's,
-- energy above the minimum over e0 (γ) of both, medians,
+- energy above the minimum over e0 (γ) of both, medians, and what is left of that of zero output: the geometric mean of ratios,
 - the mean cosine between the gradients that two of the scenes have for the weights: 1 where they agree, 0 where what
   one scene asks for tells nothing about the next. With ``trainer.batch_size`` it is of whole updates.
 """
@@ -88,18 +88,22 @@ def sizes(problem: StepProblem, moved: Tensor) -> tuple[float, float]:
 
 
 def report(steps: list[Step]) -> str:
-    lines = ["            steps   zero output [mm]   network [mm]   γ: zero  network  cosine"]
+    lines = ["            steps   zero output [mm]   network [mm]   γ: zero  network    left  cosine"]
     for name, kind in (("relaxing", True), ("regular", False)):
         chosen = [step for step in steps if step.relaxing == kind]
         if len(chosen) < 2:
             continue
         mm = torch.tensor([step.sizes for step in chosen]).median(dim=0).values.tolist()
         above = torch.tensor([step.above for step in chosen]).median(dim=0).values.tolist()
+        left = torch.tensor([network / zero for zero, network in (step.above for step in chosen)])
         count = len(chosen)
         together = float(torch.stack([step.direction for step in chosen]).sum(dim=0).square().sum())
         cosine = (together - count) / (count * (count - 1))
         lengths = f"{mm[0]:7.1f} / {mm[1]:6.1f}  {mm[2]:6.1f} / {mm[3]:6.1f}"
-        lines.append(f"{name:>9}  {count:6d}  {lengths}  {above[0]:8.3g} {above[1]:8.3g}  {cosine:6.3f}")
+        lines.append(
+            f"{name:>9}  {count:6d}  {lengths}  {above[0]:8.3g} {above[1]:8.3g}  "
+            f"{left.clamp_min(1e-6).log().mean().exp():6.3f}  {cosine:6.3f}"
+        )
     return "\n".join(lines)
 
 
