@@ -143,20 +143,22 @@ def orthogonal(blocks: Tensor, rounds: int = 5) -> Tensor:
     return x
 
 
-def make_whitening(simulator: NetworkStepper, on: bool, fresh: bool = True) -> Whitening:
-    """For the edge encoders of a model and the relative places among their features.
+def make_whitening(simulator: NetworkStepper, on: bool) -> Whitening:
+    """For the edge encoders of a model and the relative places among their features; a model that has no statistics yet is not
+    trained yet either.
 
     Raises:
         ValueError: the features have no relative places that are normalised by statistics.
     """
-    places, network = simulator.features.places, simulator.network
-    if on and not (places["mesh"] and simulator.features.edge_normalizer is not None):
+    places, network, statistics = simulator.features.places, simulator.network, simulator.features.edge_normalizer
+    if on and not (places["mesh"] and statistics is not None):
         raise ValueError("trainer.whitening: of all features only paper has relative places with statistics")
     names = {id(module): name for name, module in network.edge_encoders.named_children()}
     sets = (*network.edge_set_names, *network.world_sets) if on else ()
     encoders = {name: names[id(network.edge_encoder(name))] for name in sets}
     layers = {name: cast(MLP, network.edge_encoders[name]).first for name in encoders.values()}
     columns = {name: places["coarse" if name.startswith("coarse") else name] for name in sets}
+    fresh = statistics is None or not (statistics.frozen or statistics.num_updates)
     return Whitening(layers, encoders, columns, fresh)
 
 

@@ -101,7 +101,7 @@ class Trainer:
         shares = (rank, ranks, settings.max_vertices, settings.workers, settings.by_rollout, settings.relaxed_velocity)
         self.slots = Slots(sampler, simulator, settings.batch_size, seed, longest, *shares)
         self.model: torch.nn.Module = simulator
-        self.signal, self.whitening = Signal(settings.signal), make_whitening(simulator, settings.whitening, earlier == 0)
+        self.signal, self.whitening = Signal(settings.signal), make_whitening(simulator, settings.whitening)
         if ranks > 1:
             self.whitening.shared_sum = distributed.all_reduce_sum
             # Statistics are kept equal by their own sums; scenes are drawn by slot, so only other draws need a generator each.

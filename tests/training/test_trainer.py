@@ -181,6 +181,20 @@ def test_whitening_is_of_all_encoders_of_edges_and_of_places_alone(tmp_path: Pat
     torch.testing.assert_close(first[:, 8:], other[:, 8:], atol=2.1e-3, rtol=0)
 
 
+def test_whitening_goes_on_from_trained_weights_as_they_are(tmp_path: Path, sampler: SceneSampler) -> None:
+    """Whatever their file says of updates: published weights say nothing, but have statistics."""
+    make(tmp_path / "before", sampler, PAPER, replace(SETTINGS, iterations=6)).run()
+    weights = load_simulator(tmp_path / "before" / "model.safetensors")
+    first = weights.network.edge_encoders["mesh"].first.weight
+    before = first.detach().clone()
+    settings = replace(SETTINGS, whitening=True, learning_rate=1e-30)
+    trainer = Trainer(weights, default_potential(), sampler, settings, tmp_path / "after", 0)
+    for _ in range(5):
+        trainer.update()
+    assert set(trainer.whitening.state_dict()["bases"]) == {"mesh", "coarse0", "body"}
+    torch.testing.assert_close(first.detach(), before, atol=1e-6, rtol=0)
+
+
 def test_whitening_of_features_without_places_is_refused(tmp_path: Path, sampler: SceneSampler) -> None:
     with pytest.raises(ValueError, match="trainer.whitening: of all features only paper"):
         make(tmp_path, sampler, PHYSICAL, replace(SETTINGS, whitening=True))
