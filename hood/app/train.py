@@ -185,7 +185,8 @@ def make_trainer(config: DictConfig) -> Trainer:
     earlier = 0
     if config.weights is not None:
         earlier = _start_from(simulator, str(config.weights), fps)
-        settings = replace(settings, statistics_iterations=0)  # they come with the weights
+        if not settings.whitening:  # which is of the rows that this training sees
+            settings = replace(settings, statistics_iterations=0)  # they come with the weights
     simulator.to(str(config.device))
     warn_if_slow("trainer.precision", settings.precision, torch.device(str(config.device)))
     leave_out = str(config.data.unusable) == "skip"

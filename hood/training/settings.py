@@ -176,6 +176,8 @@ class TrainerSettings:
     ``by_rollout``: ``horizon`` and ``collision`` count training rollouts, what the released code calls iterations, see
     :meth:`count`; a rollout then has all steps of the horizon with which it began, torn or not.
     ``relaxed_velocity``: with which a rollout goes on from the relaxing step, see :class:`hood.training.slots.Slots`.
+    ``torn_strain``: a rollout ends where 1% of its edges are strained more than this, however long the horizon is. A low value
+    lets long horizons grow with what the network can do: no updates go to debris.
     ``keep_at``: iterations whose weights and checkpoint stay, in the folder ``kept`` of the run; not
     of one whose own update was skipped.
     ``precision``: of the network's latents and products; ``"bf16"`` keeps weights, their gradients and energies in float32.
@@ -194,6 +196,7 @@ class TrainerSettings:
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
     by_rollout: bool = False
     relaxed_velocity: str = "skinned"
+    torn_strain: float = 1.5
     clip_norm: float = 1.0
     signal: str = "potential"
     whitening: bool = False
@@ -236,7 +239,7 @@ class TrainerSettings:
         object.__setattr__(self, "keep_at", tuple(self.keep_at))  # a list in a config
         if any(not isinstance(iteration, int) or iteration < 1 for iteration in self.keep_at):
             raise ValueError(f"trainer.keep_at is {list(self.keep_at)}; iterations are whole numbers of at least 1")
-        for name in ("learning_rate", "clip_norm"):
+        for name in ("learning_rate", "clip_norm", "torn_strain"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be > 0")
         if not 0 <= self.ema_decay < 1:

@@ -80,8 +80,6 @@ def next_bucket(buckets: Sequence[Bucket], turns: Sequence[int]) -> int:
 
 #: Velocities after the relaxing step.
 RELAXED_VELOCITIES = ("skinned", "own", "zero")
-#: A training rollout is given up once 1% of its edges are strained beyond this: nothing can be learned from debris.
-_BROKEN_STRAIN = 1.5
 
 
 @dataclass
@@ -114,6 +112,7 @@ class Slots:
             those that run, and torn ones end.
         relaxed_velocity: after the relaxing step: ``skinned``, that of the skinned garment; ``own``, its displacement in a
             frame; ``zero``.
+        torn_strain: a rollout is torn where 1% of its edges are strained more than this.
     """
 
     def __init__(
@@ -129,8 +128,9 @@ class Slots:
         workers: int | None = 0,
         whole: bool = False,
         relaxed_velocity: str = "skinned",
+        torn_strain: float = 1.5,
     ) -> None:
-        self.whole, self.relaxed_velocity = whole, relaxed_velocity
+        self.whole, self.relaxed_velocity, self.torn_strain = whole, relaxed_velocity, torn_strain
         self.sampler, self.simulator, self.seed, self.max_horizon = sampler, simulator, seed, max_horizon
         self.buckets = make_buckets([len(garment.rest_pos) for garment in sampler.garments], batch_size, max_vertices)
         self._slots = {
@@ -199,7 +199,7 @@ class Slots:
                 vel = self._relaxed(slot, vel)
             slot.state = State(pos, vel, slot.state.origin)
             slot.age += 1
-            if not bool(torch.isfinite(pos).all()) or not self.whole and _is_debris(scene.cloth, pos):
+            if not bool(torch.isfinite(pos).all()) or not self.whole and _is_torn(scene.cloth, pos, self.torn_strain):
                 slot.window = None
         self._turns[number] += 1
 
@@ -291,6 +291,5 @@ class Slots:
         return self.simulator.prepare(window.scene.cloth, self.sampler.garments[window.template].rest_pos)
 
 
-def _is_debris(cloth: Cloth, pos: Tensor) -> bool:
-    strain = edge_strain(cloth, pos).abs()
-    return float((strain > _BROKEN_STRAIN).double().mean()) > 0.01
+def _is_torn(cloth: Cloth, pos: Tensor, strain: float) -> bool:
+    return float((edge_strain(cloth, pos).abs() > strain).double().mean()) > 0.01

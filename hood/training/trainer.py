@@ -98,8 +98,9 @@ class Trainer:
         if settings.batch_size % ranks:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
         longest = settings.horizon.maximum - settings.horizon.with_relaxing
-        shares = (rank, ranks, settings.max_vertices, settings.workers, settings.by_rollout, settings.relaxed_velocity)
-        self.slots = Slots(sampler, simulator, settings.batch_size, seed, longest, *shares)
+        shares = (rank, ranks, settings.max_vertices, settings.workers)
+        rollouts = (settings.by_rollout, settings.relaxed_velocity, settings.torn_strain)
+        self.slots = Slots(sampler, simulator, settings.batch_size, seed, longest, *shares, *rollouts)
         self.model: torch.nn.Module = simulator
         self.signal, self.whitening = Signal(settings.signal), make_whitening(simulator, settings.whitening)
         if ranks > 1:

@@ -154,6 +154,16 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
     assert "parameter_gradient_norm" not in trainer(*model).update()
 
 
+def test_given_weights_go_on_with_whitening(tmp_path: Path) -> None:
+    """What encoders see is counted first; that statistics come along is no reason to refuse."""
+    model, short = ["experiment=paper_fast"], ["trainer.iterations=3", "trainer.statistics_iterations=2"]
+    trainer(*model, *short, f"output={tmp_path}/first").run()
+    given = f"weights={tmp_path}/first/model.safetensors"
+    second = trainer(*model, *short, given, f"output={tmp_path}/second")
+    assert ["parameter_gradient_norm" in second.update() for _ in range(3)] == [False, False, True]
+    assert set(second.whitening.state_dict()["bases"]) == {"mesh", "coarse0", "coarse1", "body"}
+
+
 def test_given_weights_may_go_on_with_other_levels() -> None:
     begun = trainer("model=edges", "model.schedule=ours", "model.latent_dim=48", "model.coarse_edge=0.04", "weights=edges")
     assert begun.simulator.config["coarse_edge"] == 0.04

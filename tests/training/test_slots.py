@@ -194,6 +194,19 @@ def test_state_is_restored_between_turns(mixed: SceneSampler, simulator: Network
     assert_same(record(whole, 5), record(resumed, 5))
 
 
+@pytest.mark.parametrize(("torn_strain", "ages"), [(1.5, [1, 2, 3, 4]), (0.25, [1, 1, 1, 1])])
+def test_a_rollout_ends_where_it_is_torn(
+    sampler: SceneSampler, simulator: NetworkStepper, torn_strain: float, ages: list[int]
+) -> None:
+    """All edges are strained by 50%."""
+    slots, seen = Slots(sampler, simulator, 1, 0, 5, torn_strain=torn_strain), []
+    for _ in range(4):
+        cloth, _, state, _ = slots.batch(5)
+        slots.advance(1.5 * cloth.rest_pos, torch.zeros_like(state.vel))
+        seen.append(slots.state_dict()[0]["age"])
+    assert seen == ages
+
+
 def test_short_runs_start_no_workers(sampler: SceneSampler, simulator: NetworkStepper) -> None:
     slots = Slots(sampler, simulator, 2, 0, HORIZON, workers=2)
     with warnings.catch_warnings():
