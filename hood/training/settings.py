@@ -23,7 +23,7 @@ from hood.scene.scene import RELAXING_DT
 from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
 from hood.training.log import relative_loss
-from hood.training.slots import RELAXED_VELOCITIES
+from hood.training.slots import RELAXED_VELOCITIES, TORN_STRAIN
 
 #: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
 _QUINTIC = (3.4445, -4.7750, 2.0315)
@@ -196,7 +196,7 @@ class TrainerSettings:
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
     by_rollout: bool = False
     relaxed_velocity: str = "skinned"
-    torn_strain: float = 1.5
+    torn_strain: float = TORN_STRAIN
     clip_norm: float = 1.0
     signal: str = "potential"
     whitening: bool = False
@@ -230,6 +230,10 @@ class TrainerSettings:
         if self.relaxed_velocity not in RELAXED_VELOCITIES:
             names = " or ".join(map(repr, RELAXED_VELOCITIES))
             raise ValueError(f"trainer.relaxed_velocity {self.relaxed_velocity!r}: give {names}")
+        if self.by_rollout and self.torn_strain != TORN_STRAIN:
+            raise ValueError(
+                f"trainer.torn_strain={self.torn_strain:g}: with trainer.by_rollout=true torn rollouts go on; drop one"
+            )
         for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
             if getattr(self, name) < 1:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")

@@ -80,6 +80,8 @@ def next_bucket(buckets: Sequence[Bucket], turns: Sequence[int]) -> int:
 
 #: Velocities after the relaxing step.
 RELAXED_VELOCITIES = ("skinned", "own", "zero")
+#: ``torn_strain`` unless said otherwise: nothing can be learned from debris.
+TORN_STRAIN = 1.5
 
 
 @dataclass
@@ -112,7 +114,7 @@ class Slots:
             those that run, and torn ones end.
         relaxed_velocity: after the relaxing step: ``skinned``, that of the skinned garment; ``own``, its displacement in a
             frame; ``zero``.
-        torn_strain: a rollout is torn where 1% of its edges are strained more than this.
+        torn_strain: a rollout is torn where 1% of its edges are strained more than this, a share of their length at rest.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class Slots:
         workers: int | None = 0,
         whole: bool = False,
         relaxed_velocity: str = "skinned",
-        torn_strain: float = 1.5,
+        torn_strain: float = TORN_STRAIN,
     ) -> None:
         self.whole, self.relaxed_velocity, self.torn_strain = whole, relaxed_velocity, torn_strain
         self.sampler, self.simulator, self.seed, self.max_horizon = sampler, simulator, seed, max_horizon

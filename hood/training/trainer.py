@@ -208,7 +208,7 @@ class Trainer:
             problem = potential.prepare(simulator.rules.judged(asked))
         shown = problem if problem.state is state else replace(problem, state=state)
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
-        if collecting and simulator.output.collects_statistics:
+        if collecting and simulator.output.collects_statistics and self.whitening.fresh:  # else they came with the weights
             simulator.output.observe(self.slots.skinned_accelerations())
         with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
             prediction = (simulator if collecting else self.model)(shown, prepared, clock)

@@ -160,8 +160,11 @@ def test_given_weights_go_on_with_whitening(tmp_path: Path) -> None:
     trainer(*model, *short, f"output={tmp_path}/first").run()
     given = f"weights={tmp_path}/first/model.safetensors"
     second = trainer(*model, *short, given, f"output={tmp_path}/second")
+    scale = {name: value.clone() for name, value in second.simulator.output.named_buffers()}
     assert ["parameter_gradient_norm" in second.update() for _ in range(3)] == [False, False, True]
     assert set(second.whitening.state_dict()["bases"]) == {"mesh", "coarse0", "coarse1", "body"}
+    assert scale
+    assert all(value.equal(scale[name]) for name, value in second.simulator.output.named_buffers())  # it came with the weights
 
 
 def test_given_weights_may_go_on_with_other_levels() -> None:

@@ -146,6 +146,7 @@ def test_time_scales_that_leave_no_training_are_refused(factor: float, words: st
         (lambda: Horizon(start=8, maximum=2), "trainer.horizon.start is 8, maximum 2"),
         (lambda: WarmupCosine(floor=2), "trainer.schedule.floor is 2; it is a share"),
         (lambda: StepDecay(floor=1.5), "trainer.schedule.floor is 1.5; it is a share"),
+        (lambda: TrainerSettings(by_rollout=True, torn_strain=0.25), "trainer.torn_strain=0.25: with trainer.by_rollout=true"),
         (lambda: TrainerSettings(statistics_iterations=-2), "trainer.statistics_iterations is -2; it must be at least 0"),
     ],
 )

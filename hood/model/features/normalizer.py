@@ -191,7 +191,7 @@ class Whitening:
     def __init__(
         self, layers: Mapping[str, nn.Linear], seen_by: Mapping[str, str], columns: Mapping[str, int], fresh: bool = True
     ) -> None:
-        self._layers, self._seen_by, self._columns, self._fresh = layers, seen_by, columns, fresh
+        self._layers, self._seen_by, self._columns, self.fresh = layers, seen_by, columns, fresh
         self._moments: dict[str, Tensor] = {}  # by layer, (n + 1, n + 1): sums of the products of columns and a one
         self._bases: dict[str, Tensor] = {}  # by layer, (n + 1, n + 1): Q
         self.shared_sum: Callable[[Tensor], Tensor] | None = None  # as of a RunningNormalizer
@@ -260,7 +260,7 @@ class Whitening:
             basis = torch.eye(len(moments), dtype=moments.dtype, device=moments.device)
             basis[:-1, :-1], basis[:-1, -1] = whiten, -whiten @ mean
             self._bases[name] = basis
-            if self._fresh:
+            if self.fresh:
                 weight, bias = _both(self._layers[name])
                 _put(weight, bias, _side_by_side(weight, bias, basis) @ basis)
 
