@@ -48,7 +48,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import arms_down, holds_pose, read_pose
 from hood.assets.motion.skeleton import UP_AXES
 from hood.cli.prepare.mesh_body import fasten_as_asked, give_room, prepare_for_mesh
-from hood.media.exports.mesh import write_obj
+from hood.media.exports.sequences import write_obj
 from hood.mesh.editing.quality import check_triangles
 from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import build_scene

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.media.exports.mesh import corner_normals
 from hood.media.pieces import part_colour, pieces_of
 from hood.media.renderer.render import BODY_COLOR
 from hood.rollouts.file.reader import RolloutData
@@ -108,3 +107,13 @@ def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) 
 def _upright(pos: np.ndarray, up: str) -> np.ndarray:
     """``pos`` (…, 3) with the wanted axis up; a turn, no mirror image."""
     return pos if up == "y" else np.stack([pos[..., 0], -pos[..., 2], pos[..., 1]], axis=-1)
+
+
+def corner_normals(pos: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Unit normals (M, 3), one per number in ``corners`` (F, 3): area-weighted over the faces that share it."""
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    total = np.zeros((int(corners.max(initial=-1)) + 1, 3))
+    for k in range(3):
+        np.add.at(total, corners[:, k], cross)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

@@ -9,7 +9,7 @@ import triton.language as tl
 
 
 @triton.jit
-def _product(left, right, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
+def dot(left, right, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
     """left right, summed in float32. WIDEN: bfloat16 as float32, for Triton's interpreter, whose product has none."""
     if WIDEN:
         left, right = left.to(tl.float32), right.to(tl.float32)
@@ -17,15 +17,15 @@ def _product(left, right, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
 
 
 @triton.jit
-def _layer(x, pointer, stride, columns, present, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
+def layer_of(x, pointer, stride, columns, present, PRECISION: tl.constexpr, WIDEN: tl.constexpr):
     """x Wᵀ for a layer's weights W (out, in), rounded to the precision of ``x``; columns not present are zero."""
     mask = present[:, None] & present[None, :]
     weight = tl.load(pointer + columns[None, :] * stride + columns[:, None], mask=mask, other=0.0).to(x.dtype)
-    return _product(x, weight, PRECISION, WIDEN)
+    return dot(x, weight, PRECISION, WIDEN)
 
 
 @triton.jit
-def _vector(pointer, columns, present):
+def vector_of(pointer, columns, present):
     """A layer's bias, or scale or shift of its norm, in float32."""
     return tl.load(pointer + columns, mask=present, other=0.0).to(tl.float32)
 
@@ -49,14 +49,14 @@ def _tail(
 ):
     """The network behind its first layer, the layer norm included, in float32; ``hidden`` in float32, before its ReLU."""
     hidden = tl.maximum(hidden, 0.0).to(dtype)
-    hidden = _layer(hidden, weight_2, WIDTH, columns, present, PRECISION, WIDEN)
-    hidden = tl.maximum(hidden + _vector(bias_2, columns, present)[None, :], 0.0).to(dtype)
-    raw = _layer(hidden, weight_3, WIDTH, columns, present, PRECISION, WIDEN)
-    raw += _vector(bias_3, columns, present)[None, :]
+    hidden = layer_of(hidden, weight_2, WIDTH, columns, present, PRECISION, WIDEN)
+    hidden = tl.maximum(hidden + vector_of(bias_2, columns, present)[None, :], 0.0).to(dtype)
+    raw = layer_of(hidden, weight_3, WIDTH, columns, present, PRECISION, WIDEN)
+    raw += vector_of(bias_3, columns, present)[None, :]
     centred = tl.where(present[None, :], raw - (tl.sum(raw, axis=1) / WIDTH)[:, None], 0.0)
     variance = tl.sum(centred * centred, axis=1) / WIDTH
-    out = centred * (1.0 / tl.sqrt(variance + eps))[:, None] * _vector(scale, columns, present)[None, :]
-    return out + _vector(shift, columns, present)[None, :]
+    out = centred * (1.0 / tl.sqrt(variance + eps))[:, None] * vector_of(scale, columns, present)[None, :]
+    return out + vector_of(shift, columns, present)[None, :]
 
 
 @triton.jit
@@ -109,7 +109,7 @@ def edges_pass(
     at_ends = tables + column + columns[None, :]
     hidden = tl.load(at_ends + node[:, None] * stride, mask=both, other=0.0).to(tl.float32)
     hidden += tl.load(at_ends + WIDTH + sender[:, None] * stride, mask=both, other=0.0).to(tl.float32)
-    hidden += _layer(edge, weight_1, stride_1, columns, present, PRECISION, WIDEN)
+    hidden += layer_of(edge, weight_1, stride_1, columns, present, PRECISION, WIDEN)
     rest = (weight_2, bias_2, weight_3, bias_3, scale, shift)
     message = _tail(hidden, *rest, columns, present, eps, dtype, PRECISION, WIDEN, WIDTH)
     tl.store(latent + places, (edge.to(tl.float32) + message).to(dtype), mask=both)
@@ -117,7 +117,7 @@ def edges_pass(
     # Row i of the sums is that of all edges of the tile with the receiver of edge i: a product with a matrix of 0 and 1.
     receiver = tl.load(local_receivers + rows, mask=inside, other=-1)
     same = (receiver[:, None] == tl.load(local_receivers + rows, mask=inside, other=-2)[None, :]).to(tl.float32).to(dtype)
-    sums = _product(same, message.to(dtype), PRECISION, WIDEN)
+    sums = dot(same, message.to(dtype), PRECISION, WIDEN)
     before = tl.load(local_receivers + rows - 1, mask=inside & (rows > 0), other=-1)
     stop = tl.minimum((tile + 1) * TILE, count)
     last = tl.load(local_receivers + stop - 1)
@@ -195,11 +195,11 @@ def nodes_pass(
     places = rows[:, None].to(tl.int64) * WIDTH + columns[None, :]
     dtype = received.dtype.element_ty
     node = tl.load(nodes + places, mask=both, other=0.0)
-    hidden = _layer(node.to(dtype), weight_1, stride_1, columns, present, PRECISION, WIDEN)
+    hidden = layer_of(node.to(dtype), weight_1, stride_1, columns, present, PRECISION, WIDEN)
     for place in tl.static_range(SETS):
         sums = tl.load(received + place * count * WIDTH + places, mask=both, other=0.0)
-        hidden += _layer(sums, weight_1 + (place + 1) * WIDTH, stride_1, columns, present, PRECISION, WIDEN)
-    hidden += _vector(bias_1, columns, present)[None, :]
+        hidden += layer_of(sums, weight_1 + (place + 1) * WIDTH, stride_1, columns, present, PRECISION, WIDEN)
+    hidden += vector_of(bias_1, columns, present)[None, :]
     rest = (weight_2, bias_2, weight_3, bias_3, scale, shift)
     out = _tail(hidden, *rest, columns, present, eps, dtype, PRECISION, WIDEN, WIDTH)
     tl.store(updated + places, node + out.to(node.dtype), mask=both)

@@ -1,5 +1,5 @@
-"""A processor step on a GPU in two kernels for every edge set, one for the nodes and one product, in Triton; inference only.
-The networks beside the steps take one product and one kernel.
+"""A processor step on a GPU in two kernels for every edge set, one for the nodes and one product, in Triton. The networks
+beside the steps take one product and one kernel.
 
 Composed from single operations a step reads and writes every intermediate (N, d) array and takes about forty kernel
 launches. Here a program takes a tile of consecutive edges, or of nodes, through all its layers and the layer norm on the
@@ -10,16 +10,20 @@ node whose edges lie in one tile is summed there, every tile keeps what it knows
 and a second small pass adds that up in order. Nothing waits for the host, and the launches depend on shapes alone. The
 kernels stand behind operators of torch (``hood::step_edges``, ``hood::step_nodes``, ``hood::mlp_tail``), so that a traced or
 a compiled frame holds them like any other, and a CUDA graph records them.
+
+Backward a set takes two kernels, of its edges and of the sums at their ends, and a product that gives the gradients of three
+weights. What the forward pass knew inside a step is computed again there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from hood.model.graph.builder import EdgeSet, Subset
 from hood.tensors.dense import linear
@@ -32,15 +36,17 @@ if TYPE_CHECKING:
 #: Widest latents by precision. The weights of float32 beyond it leave a program no registers: at 128 each of its threads would
 #: keep 16 to 28 KB in memory (tests/model/kernels/test_triton_compiled.py has the limit).
 WIDEST = {torch.float32: 64, torch.bfloat16: 128}
+#: Most programs of a backward pass: each keeps sums over its tiles, which are added afterwards.
+PROGRAMS = 256
 #: How float32 is multiplied: as it is; on tensor cores as three products of parts of 10 bits, which is as good; or rounded to
 #: 10 bits.
 INPUT_PRECISIONS = ("ieee", "tf32x3", "tf32")
 
 
 def applies(width: int, dtype: torch.dtype, device: torch.device) -> bool:
-    """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, without gradients, float32 or
-    bfloat16, a multiple of 16 up to :data:`WIDEST`, where :func:`hood.tensors.precision.has_triton` says so."""
-    return not torch.is_grad_enabled() and width % 16 == 0 and width <= WIDEST.get(dtype, 0) and has_triton(device)
+    """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, float32 or bfloat16, a multiple
+    of 16 up to :data:`WIDEST`, where :func:`hood.tensors.precision.has_triton` says so."""
+    return width % 16 == 0 and width <= WIDEST.get(dtype, 0) and has_triton(device)
 
 
 def input_precision() -> str:
@@ -76,6 +82,8 @@ def take(
     if precision not in INPUT_PRECISIONS:
         raise ValueError(f"precision is {precision!r}; choose {' or '.join(INPUT_PRECISIONS)}")
     names = [name for name in step.sets if subsets[name].edges.num_edges]
+    if torch.is_grad_enabled():
+        return _take_with_gradients(step, names, nodes, edges, subsets, precision)
     updated, width = dict(edges), step.latent_dim
     low = nodes.to(next(iter(edges.values())).dtype)
     received = None if memory is None else memory.get(step.sets)
@@ -84,7 +92,8 @@ def take(
     if memory is not None:
         memory[step.sets] = received
     if names:
-        tables = _tables([cast("MLP", step.edge_mlps[name]) for name in names], low, width)
+        mlps = [cast("MLP", step.edge_mlps[name]) for name in names]
+        tables = _first_at_ends([(mlp.first.weight, mlp.first.bias) for mlp in mlps], low, width)
         for place, name in enumerate(names):
             mlp, part = cast("MLP", step.edge_mlps[name]), subsets[name]
             updated[name] = edges[name] if overwrite else edges[name].clone()
@@ -98,12 +107,12 @@ def take(
     return step_nodes(nodes.contiguous(), received, parameters, mlp.norm.eps, precision), updated
 
 
-def _tables(mlps: Sequence[MLP], nodes: Tensor, width: int) -> Tensor:
+def _first_at_ends(groups: Sequence[Sequence[Tensor]], nodes: Tensor, width: int) -> Tensor:
     """(R, 2 d S): for every set the parts of the edge network's first layer at the nodes, as receiver (bias included) and as
-    sender; one product."""
-    weights = [half for mlp in mlps for half in mlp.first.weight.split(width, dim=1)[:2]]
-    biases = [half for mlp in mlps for half in (mlp.first.bias, torch.zeros_like(mlp.first.bias))]
-    return linear(nodes, torch.cat(weights), torch.cat(biases))
+    sender; one product. ``groups``: weight and bias of that layer, and others."""
+    weights = [half for weight, *_ in groups for half in weight.split(width, dim=1)[:2]]
+    biases = [half for _, bias, *_ in groups for half in (bias, torch.zeros_like(bias))]
+    return linear(nodes, torch.cat(weights), torch.cat(biases)) if groups else nodes.new_zeros(len(nodes), 0)
 
 
 def _rows(edges: EdgeSet) -> tuple[Tensor, ...]:
@@ -213,3 +222,215 @@ def _kernels() -> Any:
     from hood.model.kernels import triton_kernels
 
     return triton_kernels
+
+
+@cache
+def _gradient_kernels() -> Any:
+    from hood.model.kernels import triton_gradients
+
+    return triton_gradients
+
+
+class _Set(NamedTuple):
+    """An edge set of a step that has edges."""
+
+    place: int  # among the step's sets
+    part: Subset
+    eps: float
+
+
+class _Setting(NamedTuple):
+    """Of a step, what no gradient is of."""
+
+    sets: tuple[_Set, ...]
+    num_sets: int
+    eps: float
+    precision: str
+
+
+#: Parameters of a network: weight and bias of its three layers, scale and shift.
+_PARAMETERS = 8
+
+
+def _take_with_gradients(
+    step: ProcessorStep,
+    names: Sequence[str],
+    nodes: Tensor,
+    edges: Mapping[str, Tensor],
+    subsets: Mapping[str, Subset],
+    precision: str,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    mlps = [*(cast("MLP", step.edge_mlps[name]) for name in names), step.node_mlp]
+    norms = [cast("torch.nn.LayerNorm", mlp.norm).eps for mlp in mlps]
+    sets = tuple(_Set(step.sets.index(name), subsets[name], eps) for name, eps in zip(names, norms[:-1], strict=True))
+    setting = _Setting(sets, len(step.sets), norms[-1], precision)
+    parameters = [one for mlp in mlps for one in (mlp.first.weight, mlp.first.bias, *mlp.tail_parameters())]
+    dtype = next(iter(edges.values())).dtype
+    updated, *latents = _Step.apply(nodes.contiguous(), dtype, setting, *(edges[name] for name in names), *parameters)
+    return updated, {**edges, **dict(zip(names, latents, strict=True))}
+
+
+class _Step(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, nodes: Tensor, dtype: torch.dtype, setting: _Setting, *given: Tensor) -> tuple[Tensor, ...]:
+        count, width = len(setting.sets), nodes.shape[1]
+        latents, groups = [one.contiguous() for one in given[:count]], _groups(given[count:])
+        low = nodes.to(dtype)
+        received = low.new_zeros(setting.num_sets, *nodes.shape)
+        tables = _first_at_ends(groups[:-1], low, width)
+        updated = [latent.clone() for latent in latents]
+        for index, (one, (first, _, *tail)) in enumerate(zip(setting.sets, groups[:-1], strict=True)):
+            where = updated[index], tables, received[one.place], 2 * width * index, *_rows(one.part.edges), one.part.rows
+            step_edges(*where, [first[:, 2 * width :], *tail], one.eps, setting.precision)
+        result = step_nodes(nodes, received, list(groups[-1]), setting.eps, setting.precision)
+        ctx.save_for_backward(low, received, tables, *latents, *given[count:])
+        ctx.setting = setting
+        return result, *updated
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_nodes: Tensor, *grad_latents: Tensor) -> tuple[Tensor | None, ...]:
+        setting: _Setting = ctx.setting
+        (low, received, tables, *rest), count = ctx.saved_tensors, len(setting.sets)
+        latents, groups, width = rest[:count], _groups(rest[count:]), low.shape[1]
+        first, bias, *tail = groups[-1]
+        seen = torch.cat([low.unsqueeze(1), received.transpose(0, 1)], dim=1).flatten(1)
+        hidden = torch.nn.functional.linear(seen, first.to(low.dtype), bias.to(low.dtype))
+        grad_hidden, of_bias, others = _tail_gradients(hidden, grad_nodes.contiguous(), tail, setting.eps, setting.precision)
+        grad_seen = grad_hidden @ first.to(low.dtype)
+        of_nodes = [(grad_hidden.t() @ seen).to(first.dtype), of_bias, *others]
+        grad_low, back, of_edges = grad_seen[:, :width], list[Tensor](), list[Tensor]()
+        if count:
+            back, of_edges, at_nodes = _edge_gradients(setting, low, tables, latents, groups[:-1], grad_latents, grad_seen)
+            grad_low = grad_low + at_nodes
+        return (grad_nodes + grad_low, None, None, *back, *of_edges, *of_nodes)
+
+
+def _edge_gradients(
+    setting: _Setting,
+    low: Tensor,
+    tables: Tensor,
+    latents: Sequence[Tensor],
+    groups: Sequence[Sequence[Tensor]],
+    grad_latents: Sequence[Tensor],
+    grad_seen: Tensor,
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Of all sets the gradients of the latents, of the edge networks' parameters, and of the nodes (R, d).
+
+    Args:
+        low: (R, d) nodes, ``tables`` (R, 2 d S) the first layer there.
+        grad_seen: (R, d (1 + sets)), behind its first d columns the gradients of the sums that nodes received.
+    """
+    count, width, like = len(setting.sets), low.shape[1], groups[0][0].dtype
+    most = max(one.part.edges.num_edges for one in setting.sets)
+    programs, grad_tables = min(PROGRAMS, -(-most // tile_of(width, low.dtype))), torch.zeros_like(tables)
+    parts = torch.zeros(count, programs, 5 * width, dtype=torch.float32, device=low.device)
+    back, squares = list[Tensor](), list[Tensor]()
+    for index, (one, latent, group) in enumerate(zip(setting.sets, latents, groups, strict=True)):
+        at_node = grad_seen[:, (1 + one.place) * width :]
+        given = (grad_latents[index].contiguous(), at_node, grad_tables, parts[index])
+        found, factors = _set_gradients(one, setting.precision, latent, tables, 2 * width * index, group, *given)
+        before, behind = factors.split(3)
+        back.append(found)
+        squares.append((behind.transpose(1, 2) @ before).to(like))
+    weights = torch.cat([half for weight, *_ in groups for half in weight.split(width, dim=1)[:2]]).to(low.dtype)
+    at_ends = (grad_tables.t() @ low).view(count, 2, width, width).to(like)
+    biases = grad_tables.sum(dim=0, dtype=like).view(count, 2, width)[:, 0]
+    vectors, of_edges = parts.sum(dim=1).view(count, 5, width).to(like), list[Tensor]()
+    for index, (own, second, third) in enumerate(squares):
+        _, two, three, scale, shift = vectors[index]
+        of_edges += [torch.cat([*at_ends[index], own], dim=1), biases[index], second, two, third, three, scale, shift]
+    return back, of_edges, grad_tables @ weights
+
+
+def _set_gradients(
+    one: _Set,
+    precision: str,
+    latent: Tensor,
+    tables: Tensor,
+    column: int,
+    group: Sequence[Tensor],
+    grad_updated: Tensor,
+    grad_received: Tensor,
+    grad_tables: Tensor,
+    parts: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The gradient of a set's latents, and the factors (6, N, d) of those of three weights; writes to the set's columns of
+    ``grad_tables``, and to ``parts``."""
+    edges, rows, count, width = one.part.edges, one.part.rows, one.part.edges.num_edges, latent.shape[1]
+    first, _, *tail = group
+    own, tiles, shape = first[:, 2 * width :], -(-count // tile_of(width, latent.dtype)), _shape(width, latent.dtype)
+    back, factors = torch.empty_like(latent) if rows is None else grad_updated.clone(), latent.new_empty(6, count, width)
+    which = (
+        latent,
+        tables,
+        tables.stride(0),
+        column,
+        edges.receivers,
+        edges.senders,
+        edges.receivers if rows is None else rows,
+    )
+    given = (own, own.stride(0), *tail[:5], grad_updated, grad_received, grad_received.stride(0))
+    options = options_of(width, latent, precision)
+    _gradient_kernels().edges_back[(min(len(parts), tiles),)](
+        *which, *given, back, factors, parts, count, tiles, one.eps, **options, **shape, SOME=rows is not None
+    )
+    where = (edges.nodes, edges.offsets, edges.reverse, grad_tables, grad_tables.stride(0), column, len(edges.nodes))
+    _gradient_kernels().ends_back[(-(-len(edges.nodes) // shape["TILE"]),)](factors[3], *where, **shape)
+    return back, factors
+
+
+class _TailStep(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, residual: Tensor | None, eps: float, precision: str, *parameters: Tensor) -> Tensor:
+        ctx.save_for_backward(hidden, *parameters)
+        ctx.eps, ctx.precision = eps, precision
+        return mlp_tail(hidden, residual, list(parameters), eps, precision)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, *parameters = ctx.saved_tensors
+        back, _, others = _tail_gradients(hidden.contiguous(), grad.contiguous(), parameters, ctx.eps, ctx.precision)
+        return back, grad if ctx.needs_input_grad[1] else None, None, None, *others
+
+
+def tail_step(hidden: Tensor, residual: Tensor | None, parameters: Sequence[Tensor], eps: float, precision: str) -> Tensor:
+    """:func:`mlp_tail`, with gradients where they are asked for."""
+    if not torch.is_grad_enabled():
+        return mlp_tail(hidden, residual, list(parameters), eps, precision)
+    result: Tensor = _TailStep.apply(hidden, residual, eps, precision, *parameters)
+    return result
+
+
+def _tail_gradients(
+    hidden: Tensor, grad: Tensor, parameters: Sequence[Tensor], eps: float, precision: str
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """The gradients of ``hidden`` (N, d), of a bias added to it, and of the parameters."""
+    (count, width), dtype = hidden.shape, parameters[0].dtype
+    tiles = -(-count // tile_of(width, hidden.dtype))
+    programs, back, factors = min(PROGRAMS, max(tiles, 1)), torch.empty_like(hidden), hidden.new_empty(4, count, width)
+    parts = torch.zeros(programs, 5 * width, dtype=torch.float32, device=hidden.device)
+    if count:
+        given = (hidden, grad, *parameters[:5], back, factors, parts, count, tiles, eps)
+        _gradient_kernels().tail_back[(programs,)](
+            *given, **options_of(width, hidden, precision), **_shape(width, hidden.dtype)
+        )
+    before, behind = factors.split(2)
+    second, third = (behind.transpose(1, 2) @ before).to(dtype)
+    one, two, three, scale, shift = parts.sum(dim=0).to(dtype).split(width)
+    return back, one, [second, two, third, three, scale, shift]
+
+
+def _ends(part: Subset) -> tuple[Tensor, Tensor, Tensor]:
+    """Receivers, senders, and rows of the set; any array where these are all of them."""
+    edges = part.edges
+    return edges.receivers, edges.senders, edges.receivers if part.rows is None else part.rows
+
+
+def _groups(parameters: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+    return [parameters[i : i + _PARAMETERS] for i in range(0, len(parameters), _PARAMETERS)]
+
+
+def _shape(width: int, dtype: torch.dtype) -> dict[str, Any]:
+    return {"WIDTH": width, "PADDED": _power_of_two(width), "TILE": tile_of(width, dtype)}

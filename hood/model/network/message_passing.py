@@ -166,8 +166,8 @@ class ProcessorStep(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes (N, latent_dim) and edge latents by set; ``subsets`` says which rows of a set take part.
 
-        With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. Without gradients
-        a CUDA device with Triton takes :mod:`hood.model.kernels.triton_step`, which keeps in ``memory`` what steps with the
+        With ``overwrite`` the edge latents given may be used for the new ones where no gradient is asked for. A CUDA device
+        with Triton takes :mod:`hood.model.kernels.triton_step`, which without gradients keeps in ``memory`` what steps with the
         same sets and subsets write to.
         """
         if triton_step.applies(self.latent_dim, next(iter(edges.values())).dtype, nodes.device) and self._is_own():

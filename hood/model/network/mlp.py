@@ -49,7 +49,7 @@ class MLP(nn.Module):
         if self.compiled and block.applies(hidden, parameters):
             return block.tail_compiled(hidden, residual, block.Setting(keep, self.norm.eps), *parameters)
         if type(self) is MLP and triton_step.applies(hidden.shape[1], hidden.dtype, hidden.device):
-            return triton_step.mlp_tail(hidden, residual, list(parameters), self.norm.eps, triton_step.input_precision())
+            return triton_step.tail_step(hidden, residual, parameters, self.norm.eps, triton_step.input_precision())
         result: Tensor = _Tail.apply(hidden, residual, keep, self.norm.eps, *parameters)
         return result
 

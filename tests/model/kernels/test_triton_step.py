@@ -4,6 +4,7 @@ Triton decides at its import whether it interprets, so the kernels run in a proc
 computes all cases and writes what came out.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -107,6 +108,51 @@ def _there(rows: Tensor | None, device: str) -> Tensor | None:
     return None if rows is None else rows.to(device)
 
 
+def gradients(case: Case, taken: tuple[Tensor, dict[str, Tensor]], inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Of a sum of all results with random weights, by the nodes, the sets and the parameters; zeros where there is none."""
+    draw = torch.Generator().manual_seed(5)
+    results = [taken[0], *taken[1].values()]
+    weighted = [(x.float() * torch.randn(x.shape, generator=draw).to(x.device)).sum() for x in results]
+    wanted = inputs | dict(case.step.named_parameters())
+    found = torch.autograd.grad(sum(weighted[1:], weighted[0]), list(wanted.values()), allow_unused=True)
+    return {
+        name: torch.zeros_like(x).float() if grad is None else grad.float()
+        for (name, x), grad in zip(wanted.items(), found, strict=True)
+    }
+
+
+def gradients_of(case: Case, fused: bool, dtype: torch.dtype | None = None) -> dict[str, Tensor]:
+    """Of the kernels or of the plain path, with the latents in ``dtype`` if given."""
+    case.step.requires_grad_(True)
+    with torch.enable_grad():
+        nodes = case.nodes.clone().requires_grad_(True)
+        latents = {name: x.to(dtype or x.dtype).clone().requires_grad_(True) for name, x in case.latents.items()}
+        take = functools.partial(triton_step.take, case.step) if fused else case.step
+        return gradients(case, take(nodes, latents, case.subsets), {"nodes": nodes, **latents})
+
+
+def apart(found: dict[str, Tensor], reference: dict[str, Tensor]) -> float:
+    """Distance of two gradients as a whole, relative to the second."""
+    off, whole = (
+        torch.cat([x.flatten() for x in one])
+        for one in ([found[name] - reference[name] for name in reference], list(reference.values()))
+    )
+    return float(off.norm() / whole.norm())
+
+
+def assert_equal_gradients(found: dict[str, Tensor], case: Case) -> None:
+    """In float32 those of the plain path, each of them; in bfloat16, where a rounding more opens other ReLUs, at most twice
+    as far from those of float32 as the plain path's are."""
+    reference = gradients_of(case, False, torch.float32)
+    if case.latents["mesh"].dtype == torch.bfloat16:
+        assert apart(found, reference) < 2 * apart(gradients_of(case, False), reference)
+        return
+    assert apart(found, reference) < 1e-6
+    floor = 1e-2 * max(float(x.norm()) for x in reference.values())
+    for name, value in reference.items():
+        assert float((found[name] - value).norm()) <= 2e-6 * max(float(value.norm()), floor), name
+
+
 def assert_equal_step(result: tuple[Tensor, dict[str, Tensor]], case: Case) -> None:
     """Latents within the bound of the RMS of the plain path's in float32; rows that take no part are as they were."""
     bound = BOUND[case.latents["mesh"].dtype]
@@ -133,6 +179,27 @@ def tail_of(width: int, dtype: str) -> tuple[MLP, Tensor, Tensor]:
     assert mlp.norm is not None
     mlp.norm.weight.normal_()
     return mlp, torch.randn(77, width).to(DTYPES[dtype]), torch.randn(77, width)
+
+
+def tail_gradients(mlp: MLP, hidden: Tensor, residual: Tensor) -> dict[str, Tensor]:
+    """Of a network's weighted result by its input, what is added, and its parameters."""
+    mlp.requires_grad_(True)
+    with torch.enable_grad():
+        hidden, residual = (x.clone().requires_grad_(True) for x in (hidden, residual))
+        wanted = {"hidden": hidden, "residual": residual} | dict(
+            zip("2 b2 3 b3 scale shift".split(), mlp.tail_parameters(), strict=True)
+        )
+        weights = torch.randn(hidden.shape, generator=torch.Generator().manual_seed(5))
+        found = torch.autograd.grad((mlp.tail(hidden, residual) * weights).sum(), list(wanted.values()))
+    return {name: grad.float() for name, grad in zip(wanted, found, strict=True)}
+
+
+@pytest.mark.parametrize("width, dtype", TAILS)
+def test_their_gradients_as_well(interpreted, width, dtype):
+    mlp, hidden, residual = tail_of(width, dtype)
+    found, reference = interpreted["tail gradients", width, dtype], tail_gradients(mlp, hidden.float(), residual)
+    most = 1e-6 if dtype == "fp32" else 2 * apart(tail_gradients(mlp, hidden, residual), reference)
+    assert apart(found, reference) < most
 
 
 @pytest.mark.parametrize("width, dtype", TAILS)
@@ -169,12 +236,20 @@ def test_latents_are_those_of_the_plain_path(interpreted, graph, width, dtype):
     assert_equal_step(interpreted[graph, width, dtype], make(graph, width, dtype))
 
 
+@pytest.mark.parametrize("graph, width, dtype", CASES)
+def test_gradients_are_those_of_the_plain_path(interpreted, graph, width, dtype):
+    assert_equal_gradients(interpreted["gradients", graph, width, dtype], make(graph, width, dtype))
+
+
 @pytest.mark.slow
-def test_latents_of_five_hundred_random_steps(tmp_path):
+def test_latents_and_gradients_of_five_hundred_random_steps(tmp_path):
     results = interpret(tmp_path, "RANDOM", 3600)
-    assert len(results) >= 500
+    assert len(results) >= 2 * 500
     for key, result in results.items():
-        assert_equal_step(result, make(*key))
+        if key[0] == "gradients":
+            assert_equal_gradients(result, make(*key[1:]))
+        else:
+            assert_equal_step(result, make(*key))
 
 
 def test_the_graphs_cover_every_kind_of_border():
@@ -187,10 +262,10 @@ def test_the_graphs_cover_every_kind_of_border():
     assert not torch.equal(sets["gaps"].receivers, sets["gaps"].local_receivers)
 
 
-def test_only_a_cuda_device_without_gradients_takes_it(monkeypatch):
+def test_only_a_cuda_device_takes_it(monkeypatch):
     cuda, cpu = torch.device("cuda"), torch.device("cpu")
     monkeypatch.setattr(triton_device, "_supported", lambda device: True)
-    assert not triton_step.applies(64, torch.float32, cuda)
+    assert triton_step.applies(64, torch.float32, cuda)
     with torch.no_grad():
         assert triton_step.applies(64, torch.float32, cuda)
         assert triton_step.applies(64, torch.bfloat16, cuda)
@@ -248,6 +323,9 @@ def test_compiled_on_a_gpu(graph, width, dtype):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOOD_TRITON", "off")
         assert_equal_step(result, case)
+        first, second = gradients_of(case, True), gradients_of(case, True)
+        assert all(torch.equal(first[name], second[name]) for name in first)
+        assert_equal_gradients(first, case)
 
 
 def main(cases: list[tuple[str, int, str]], path: str) -> None:
@@ -257,11 +335,13 @@ def main(cases: list[tuple[str, int, str]], path: str) -> None:
         case = make(*key)
         results[key] = case.fused(overwrite=key[0] == "hub")
         assert (results[key][1]["mesh"] is case.latents["mesh"]) == (key[0] in ("hub", "none"))
+        results["gradients", *key] = gradients_of(make(*key), True)
     if cases is CASES:
         for key in TAILS:
             mlp, hidden, residual = tail_of(*key)
             with assumed():
                 results["tail", *key] = (mlp.tail(hidden), mlp.tail(hidden, residual))
+                results["tail gradients", *key] = tail_gradients(mlp, hidden, residual)
     torch.save(results, path)
 
 
