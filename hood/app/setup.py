@@ -20,7 +20,7 @@ from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
 from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
 from hood.app.settings.compose import ConfigError, brief, require_choice
-from hood.app.settings.rollout_settings import RolloutSettings, measurement
+from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes, measurement
 from hood.app.stepping.automatic import Choice, choose, decided
 from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
 from hood.app.stepping.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
@@ -37,8 +37,9 @@ from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene, dress
+from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
-from hood.steppers.static_shapes.simulator import MODES, network_of
+from hood.steppers.static_shapes.simulator import MODES, CapturedSimulator, network_of
 from hood.steppers.watched import WatchedStepper
 from hood.tensors.precision import PRECISIONS, TF32
 
@@ -70,7 +71,7 @@ def check_config(config: RolloutSettings) -> None:
     require_choice(config, "precision", (*PRECISIONS, TF32))
     option_of(config)
     wanted_of(config)
-    require_choice(config, "step", (PLAIN, *MODES))
+    require_choice(config, "step", (AUTO, PLAIN, *MODES))
     check_refinement(config)
     check_guard(config)
     check_cloth_contact(config)
@@ -121,6 +122,7 @@ def set_up(
         scene = with_held_layers_apart(scene)
     if not option_of(settled).network and network_of(stepper) is not None:
         stepper, _ = make_stepper(settled)
+    stepper, settled = _by_itself(stepper, settled)
     stepper = refined(stepper, settled, scene.cloth.num_vertices, potential_of(settled))
     _check_start(settled, stepper, scene, tell)
     tell_if_off(settled, 1 if scene.outfit is None else len(scene.outfit.names))
@@ -185,10 +187,25 @@ def solves_in_double(config: RolloutSettings) -> bool:
 def make_stepper(config: RolloutSettings) -> tuple[Stepper, str]:
     """What takes the steps, before they are refined, and the SHA-256 of its weights (``none`` without a network)."""
     config, _ = decided(config)
-    option, step = option_of(config), str(config.step)
+    option, step = option_of(config), str(config.step) if fixed_shapes(config) else PLAIN
     if option.network:
         return make_network(config, str(config.checkpoint), config.get("model"), step)
     return make_solver(option, config, potential_of(config), step), "none"
+
+
+def _by_itself(stepper: Stepper, config: RolloutSettings) -> tuple[Stepper, RolloutSettings]:
+    """What ``step=auto`` becomes: a CUDA graph where a network takes the steps alone and nothing in the command needs plain
+    ones."""
+    if str(config.step) != AUTO:
+        return stepper, config
+    if torch.device(str(config.device)).type == "cuda" and isinstance(stepper, NetworkStepper) and chosen(config) is None:
+        asked = config.with_values(step="captured")
+        try:
+            check_config(asked)
+            return CapturedSimulator(stepper, "captured", or_plain=True), asked
+        except ValueError:  # which says what needs plain steps
+            pass
+    return stepper, config.with_values(step=PLAIN)
 
 
 def _check_start(config: RolloutSettings, stepper: Stepper, scene: Scene, tell: Callable[[str], None]) -> None:

@@ -30,10 +30,11 @@ PLAIN = ("metrics=none", "guard=off")
 
 #: The command of each way.
 ROLLOUTS: dict[str, tuple[str, ...]] = {
-    "network": ("garment=tshirt", *NETWORK),
+    "network": ("garment=tshirt", *NETWORK, "step=plain"),
+    "network captured by itself": ("garment=tshirt", *NETWORK),
     "network fixed": ("garment=tshirt", *NETWORK, *PLAIN, "step=fixed"),
     "network captured": ("garment=tshirt", *NETWORK, *PLAIN, "step=captured"),
-    "paper's features": ("garment=tshirt", "checkpoint=small-ours", "refine=0", "settle=paper"),
+    "paper's features": ("garment=tshirt", "checkpoint=small-ours", "refine=0", "settle=paper", "step=plain"),
     "solver": ("garment=tshirt", *SOLVER),
     "solver captured": ("garment=tshirt", *SOLVER, *PLAIN, "step=captured"),
     "refined": ("garment=tshirt", "checkpoint=quickstart", "refine=2"),

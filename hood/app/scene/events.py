@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from hood.app.settings.compose import ConfigError, plain
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes
 from hood.assets.files.library import unknown
 from hood.assets.garment.pins import pin_mask
 from hood.rollouts.file.reader import RolloutData
@@ -187,7 +187,7 @@ def checked_events(config: RolloutSettings) -> tuple[Asked, ...]:
         raise ConfigError(f"events={given}: give a list, {_FORM}")
     asked = tuple(_asked(index, event) for index, event in enumerate(given))
     held = next((one for one in asked if one.action in VERTICES), None)
-    if held is not None and str(config.step) != "plain":
+    if held is not None and fixed_shapes(config):
         raise ConfigError(
             f"events[{held.index}]: step={config.step} has fixed shapes, in which the same vertices are held; use step=plain"
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from hood.app.scene.garment_files import read_garment
 from hood.app.settings.compose import ConfigError, brief, plain, require_choice, shown
-from hood.app.settings.rollout_settings import Settings
+from hood.app.settings.rollout_settings import Settings, fixed_shapes
 from hood.assets.body.load import load_body
 from hood.assets.fitting.alterations import OPENING, SHORT, join_short_edges, part_open_seams, turn_flat_faces
 from hood.assets.fitting.placement import require_metres, used
@@ -208,7 +208,7 @@ def checked_sizes(config: Settings) -> Sizes:
         except (ValueError, TypeError) as error:
             raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
     sizes = replace(sizes_of(size, end, seconds), parts=tuple(parts.values()))
-    if sizes.changing and str(config.step) != "plain":
+    if sizes.changing and fixed_shapes(config):
         raise ConfigError(
             f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
         )

@@ -95,7 +95,8 @@ def named_today(words: Sequence[str], command: str = "rollout") -> tuple[str, ..
 def with_network(words: Sequence[str]) -> tuple[str, ...]:
     """The words of a rollout; ``stepper=network`` among them where it is left to ``auto`` and one is about a network alone."""
     said = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words}
-    means = any(key.split(".")[0] in (*NETWORK_KEYS, "refine") for key in said) or said.get("step", "plain") != "plain"
+    fixed = said.get("step", "auto") not in ("plain", "auto")
+    means = fixed or any(key.split(".")[0] in (*NETWORK_KEYS, "refine") for key in said)
     return (*words, "stepper=network") if means and said.get("stepper", "auto") == "auto" else tuple(words)
 
 

@@ -185,6 +185,11 @@ _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
 }
 
 
+def fixed_shapes(config: Mapping[Any, Any]) -> bool:
+    """Whether ``step`` asks for steps of fixed shapes; ``auto`` takes them only where nothing speaks against it."""
+    return str(config["step"]) not in ("plain", "auto")
+
+
 def refinement(config: Mapping[Any, Any]) -> Refinement:
     """What ``refine`` says. Raises ConfigError where a part of its table is unknown or of another kind, as the others do."""
     return _read(config, "refine", Refinement)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, brief, plain
-from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, refinement
+from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, fixed_shapes, refinement
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
 from hood.assets.files.library import unknown
@@ -101,7 +101,7 @@ def _hindrance(config: RolloutSettings, potential: Potential | None = None) -> s
     method, mode = refinement(config).method, cloth_contact(config).mode
     if method != "newton":
         return f"refine={{method:{method},…}} moves vertices through cloth; use method:newton"
-    if str(config.step) != "plain":
+    if fixed_shapes(config):
         return f"step={config.step} has fixed shapes, which contact of cloth with cloth has not; use step=plain"
     terms = (potential or losses_of(config)).terms
     if mode == "auto" and _are_published(terms):

@@ -12,7 +12,7 @@ import numpy as np
 
 from hood.app.notices import say
 from hood.app.settings.compose import ConfigError, build, require_choice
-from hood.app.settings.rollout_settings import RolloutSettings, measurement, refinement
+from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes, measurement, refinement
 from hood.energies.potential import Potential
 from hood.rollouts.checks.guard import (
     CHECK,
@@ -61,7 +61,7 @@ def check_guard(config: RolloutSettings) -> None:
     """Raise ConfigError where the guard cannot do what is asked for."""
     require_choice(config, "guard", MODES)
     mode, step = str(config.guard), str(config.step)
-    if step == "plain":
+    if not fixed_shapes(config):
         return
     if mode == REPAIR:
         raise ConfigError(f"guard=repair: step={step} has fixed shapes, a step that is repaired has not; use step=plain")
@@ -77,7 +77,7 @@ def make_guard(config: RolloutSettings, stepper: Stepper, potential: Potential) 
     mode = str(config.guard)
     if mode == OFF:
         return None
-    if str(config.step) != "plain" and measurement(config).kind != "all":
+    if fixed_shapes(config) and measurement(config).kind != "all":
         say(
             f"guard=off: step={config.step} with metrics={measurement(config).kind} measures nothing that a guard could look at"
         )

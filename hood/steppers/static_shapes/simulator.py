@@ -8,6 +8,7 @@ needs to see it once. Its result is that of :meth:`hood.steppers.network.Network
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -170,6 +171,7 @@ class CapturedSimulator:
         mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph of them, replayed at once; ``compiled``:
             through torch.compile, and on CUDA captured as well.
         capacity: places to begin with.
+        or_plain: where a step has no such form, or it cannot be made here, take the simulator's own; a warning says why.
 
     Raises:
         ValueError: an unknown mode, ``captured`` without CUDA, or ``compiled`` of compiled kernels.
@@ -177,7 +179,9 @@ class CapturedSimulator:
 
     times: tuple[str, ...] = ("step", "rest", "total")
 
-    def __init__(self, simulator: NetworkStepper, mode: str = "captured", capacity: Capacity | None = None) -> None:
+    def __init__(
+        self, simulator: NetworkStepper, mode: str = "captured", capacity: Capacity | None = None, or_plain: bool = False
+    ) -> None:
         if mode not in MODES:
             raise ValueError(f"step is {mode!r}; choose plain, {', '.join(MODES[:-1])} or {MODES[-1]}")
         if mode == "captured" and simulator.gravity.device.type != "cuda":
@@ -188,7 +192,7 @@ class CapturedSimulator:
         check_precision(simulator.network.precision, simulator.gravity.device)
         self.simulator, self.mode = simulator, mode
         self.gravity, self.config, self.metrics = simulator.gravity, simulator.config, simulator.metrics
-        self._capacity = capacity
+        self._capacity, self._or_plain, self._gave_up = capacity, or_plain, False
         self._plans: dict[Any, _Plan] = {}
 
     @property
@@ -204,19 +208,31 @@ class CapturedSimulator:
         return problem
 
     @torch.no_grad()
-    def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> StepPrediction:
+    def predict(self, problem: StepProblem, prepared: Prepared, watch: Stopwatch | None = None) -> Prediction:
         """Positions, accelerations and velocities at t + 1."""
         with timed(watch, "step"):
             self.simulator.rules.check(problem.step.dt)
-            plan = self._plan(problem, prepared)
+            if not self._gave_up:
+                try:
+                    return self._take(problem, prepared)
+                except (ValueError, RuntimeError) as error:
+                    if not self._or_plain:
+                        raise
+                    self._gave_up = True
+                    self._plans.clear()
+                    warnings.warn(f"step=plain: no CUDA graph of a step could be made ({error})", stacklevel=2)
+            return self.simulator.predict(self.simulator.search(problem), prepared)
+
+    def _take(self, problem: StepProblem, prepared: Prepared) -> StepPrediction:
+        plan = self._plan(problem, prepared)
+        result = plan.take(problem)
+        counts = _read(result.num_found)
+        while not plan.layout.capacity.holds(counts):
+            plan = self._make_plan(problem, prepared, capacity_for(counts, _limits(problem)))
             result = plan.take(problem)
             counts = _read(result.num_found)
-            while not plan.layout.capacity.holds(counts):
-                plan = self._make_plan(problem, prepared, capacity_for(counts, _limits(problem)))
-                result = plan.take(problem)
-                counts = _read(result.num_found)
-            # The next step writes to the same memory.
-            next_pos, acc, next_vel = (value.clone() for value in result[:3])
+        # The next step writes to the same memory.
+        next_pos, acc, next_vel = (value.clone() for value in result[:3])
         return StepPrediction(next_pos, acc, next_vel=next_vel)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hood.app.settings.compose import ConfigError, plain
 from hood.app.settings.python_words import overrides
-from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, with_value
+from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, fixed_shapes, with_value
 from hood.app.stepping.cloth_contact import acts
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import losses_of
@@ -180,7 +180,7 @@ def parts_of(config: RolloutSettings, steppers: bool = False) -> list[Part]:
 def _steppers(config: RolloutSettings) -> list[Part]:
     """Other ways to take the steps: of a solver a network and fewer iterations, of a network the solver."""
     goal = chosen(config)
-    if (goal is not None and goal.unit) or str(config.step) != "plain":
+    if (goal is not None and goal.unit) or fixed_shapes(config):
         return []
     asked = str(config.stepper)
     ways: list[tuple[str, str, tuple[str, ...]]] = []

@@ -7,12 +7,14 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from hood.app import setup
 from hood.app.candidates import make_candidate
 from hood.app.settings.compose import ConfigError, load_config, options
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.steppers import find_option, make_solver, option_of, with_stepper
 from hood.cli.main import main
 from hood.energies.potential import default_potential
+from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.newton import NewtonStepper
 from hood.steppers.refined import GuessStepper, RefinedStepper
 
@@ -76,6 +78,31 @@ def test_keys_that_the_class_does_not_take_are_refused() -> None:
     option.made_by["share"] = 0.1
     with pytest.raises(ConfigError, match="stepper=newton: .* is called with a potential"):
         make_solver(option, load_config("evaluate"), default_potential())
+
+
+@pytest.mark.parametrize(
+    ("words", "step"),
+    [
+        (["device=cuda", "refine=0"], "captured"),
+        (["device=cuda", "refine=5"], "plain"),
+        (["device=cuda", "refine=0", "guard=repair"], "plain"),
+        (["device=cuda", "refine=0", "size_end=1.1"], "plain"),
+        (["device=cuda", "refine=0", "step=plain"], "plain"),
+        (["refine=0"], "plain"),
+        (["refine=0", "step=fixed"], "fixed"),
+    ],
+)
+def test_a_gpu_takes_a_network_alone_as_a_graph(words: list[str], step: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def capture(simulator: NetworkStepper, mode: str, or_plain: bool) -> str:
+        assert or_plain
+        return mode
+
+    monkeypatch.setattr(setup, "CapturedSimulator", capture)
+    monkeypatch.setattr(setup, "require_device", lambda config: None)
+    network = build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8).eval()
+    stepper, config = setup._by_itself(network, RolloutSettings.from_words(["stepper=network", *words]))
+    assert str(config.step) == step
+    assert stepper == ("captured" if step == "captured" else network)
 
 
 @pytest.mark.parametrize(

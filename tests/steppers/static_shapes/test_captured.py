@@ -298,6 +298,25 @@ def test_operations_on_weights_and_on_the_cloth_at_rest_are_not_repeated(skirt_s
 # ---- refusals ---------------------------------------------------------------------------------------------------------
 
 
+def test_where_no_step_can_be_made_the_plain_ones_are_taken(skirt_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(*_: object) -> None:
+        raise RuntimeError("out of memory")
+
+    simulator, problem = make(), problem_of(skirt_scene)
+    prepared = prepare(simulator, skirt_scene)
+    monkeypatch.setattr("hood.steppers.static_shapes.simulator._Plan", no_memory)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        CapturedSimulator(simulator, "fixed").predict(problem, prepared)
+    captured = CapturedSimulator(simulator, "fixed", or_plain=True)
+    with pytest.warns(UserWarning, match=r"step=plain: no CUDA graph of a step could be made \(out of memory\)"):
+        first = captured.predict(problem, prepared)
+    with torch.no_grad():
+        plain = simulator.predict(simulator.search(problem), prepared)
+    assert torch.equal(first.next_pos, plain.next_pos)
+    assert torch.equal(captured.predict(problem, prepared).next_pos, plain.next_pos)  # without asking again
+    assert torch.equal(captured.next_velocity(problem, first), simulator.next_velocity(problem, plain))
+
+
 def test_steps_that_do_not_exist_are_refused() -> None:
     with pytest.raises(ValueError, match="step is 'quick'; choose plain, fixed, captured or compiled"):
         CapturedSimulator(make(), "quick")
