@@ -1,7 +1,7 @@
 """The kernels of a frame that torch.compile makes, counted without a GPU: of ``step=compiled`` with the Triton kernels in it.
 
     python benchmarks/compiled_kernels.py small-ours 1000          # a model by name, vertices of the dress
-    python benchmarks/compiled_kernels.py quickstart 1000
+    python benchmarks/compiled_kernels.py quickstart 1000 bf16     # the network in bfloat16
     python benchmarks/compiled_kernels.py newton 12000             # the solver, five iterations
 
 The compiler's scheduler decides on a CPU what is one kernel, and nothing is generated or run. A GPU's scheduler decides alike,
@@ -58,6 +58,7 @@ class Frame:
     kernels: Counter[str] = field(default_factory=Counter)  # by kind; those that the compiler writes itself are ``fused``
     moved: Counter[str] = field(default_factory=Counter)  # bytes by kind
     seconds: float = 0.0  # of an H100
+    precision: str = "fp32"
 
     def add(self, node: Any) -> None:
         kind, device = type(node).__name__, DATA_SHEETS["h100"]
@@ -74,7 +75,7 @@ class Frame:
         work = matrices(node.node) if own else int(node.estimate_flops() or 0)
         self.kernels[name] += number
         self.moved[name] += moved
-        self.seconds += max(number * device.replay, moved / device.bandwidth, work / device.matmul["fp32"])
+        self.seconds += max(number * device.replay, moved / device.bandwidth, work / device.matmul[self.precision])
 
 
 def matrices(operator: Any) -> int:
@@ -84,11 +85,11 @@ def matrices(operator: Any) -> int:
     return 2 * max(shape[0] for shape in shapes if shape) * weights
 
 
-def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Frame:
+def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor], precision: str = "fp32") -> Frame:
     """What the compiler makes of a traced frame."""
     from torch._inductor.scheduler import Scheduler
 
-    found = Frame()
+    found = Frame(precision=precision)
 
     def count(self: Any) -> None:
         for node in self.nodes:
@@ -118,15 +119,17 @@ def _concatenate_as_on_a_gpu() -> None:
 
 
 @torch.no_grad()
-def main(model: str, size: int) -> None:
+def main(model: str, size: int, precision: str = "fp32") -> None:
     torch.set_num_threads(1)
     bench = Bench(size, "cpu", 1)
-    function, inputs = newton_frame(bench) if model == SOLVER else network_frame(bench, model)
+    function, inputs = newton_frame(bench) if model == SOLVER else network_frame(bench, model, precision)
     with assumed():
         module = trace(function, inputs)
-        frame = schedule(module, inputs)
+        frame = schedule(module, inputs, precision)
     kernels = frame.kernels
-    print(f"{model}, {size:,} vertices: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels")
+    print(
+        f"{model}, {size:,} vertices, {precision}: {count_operations(module):,} operations, {sum(kernels.values()):,} kernels"
+    )
     print(f"{sum(frame.moved.values()) / 1e9:.2f} GB, {1e3 * frame.seconds:.2f} ms on an H100 (computed)")
     for name, number in kernels.most_common():
         print(f"{number:6,}  {frame.moved[name] / 1e9:6.2f} GB  {name}")
@@ -142,8 +145,9 @@ def newton_frame(bench: Bench) -> tuple[Any, list[torch.Tensor]]:
     return NewtonFrame(*given, dense=True), inputs
 
 
-def network_frame(bench: Bench, model: str) -> tuple[Any, list[torch.Tensor]]:
+def network_frame(bench: Bench, model: str, precision: str) -> tuple[Any, list[torch.Tensor]]:
     problem, simulator = bench.problems[0], load_simulator(locate("weights", model)).eval()
+    simulator.network.use_precision(precision)
     static = simulator.prepare(problem.cloth, bench.scene.garment.rest_pos).static
     assert static is not None
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
@@ -154,4 +158,4 @@ def network_frame(bench: Bench, model: str) -> tuple[Any, list[torch.Tensor]]:
 
 if __name__ == "__main__":
     os.environ["TORCHINDUCTOR_FORCE_DISABLE_CACHES"] = "1"
-    main(sys.argv[1], int(sys.argv[2]))
+    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

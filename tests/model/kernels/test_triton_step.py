@@ -4,23 +4,29 @@ Triton decides at its import whether it interprets, so the kernels run in a proc
 computes all cases and writes what came out.
 """
 
+import collections
+import contextlib
 import functools
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from hood.model.graph.builder import EdgeSet, Subset, edge_set
 from hood.model.kernels import triton_step
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
+from hood.steppers.static_shapes.cuda_graph import VIEWS
 from hood.tensors import precision as triton_device
+from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import assumed, products
 
 TILE = 32  # of the widest tiles
@@ -296,6 +302,49 @@ def test_a_network_of_an_own_class_is_asked_itself(monkeypatch):
     case.step.node_mlp.__class__ = Doubled
     with assumed(), torch.no_grad():
         case.expected()
+
+
+class Launches(TorchDispatchMode):
+    """Counts operations that start something on a device; those of our own operators are counted where they start kernels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        allocates = ("empty", "empty_like", "new_empty", "lift_fresh")
+        self.count += func.namespace != "hood" and func._opname not in (*VIEWS, *allocates)
+        return func(*args, **(kwargs or {}))
+
+    def kernels(self) -> SimpleNamespace:
+        """In the place of the modules of the kernels: counts those that are started."""
+
+        def launch(*arguments: object, **options: object) -> None:
+            self.count += 1
+
+        names = ("edges_pass", "border_pass", "nodes_pass", "tail_pass", "edges_back", "ends_back", "tail_back")
+        return SimpleNamespace(**{name: collections.defaultdict(lambda: launch) for name in names})
+
+
+@pytest.mark.parametrize(("sets", "limit"), [(("mesh",), 42), (("mesh", "coarse0"), 51), (("mesh", "coarse0", "coarse1"), 60)])
+def test_an_update_starts_a_quarter_of_the_kernels(sets, limit, monkeypatch):
+    """Forward and backward through a step. The limits may fall, not rise."""
+    case, names = make("ring", 64, "fp32"), (*sets, "body")
+    step, which = ProcessorStep(names, 64), {name: "body" if name == "body" else "mesh" for name in names}
+    found = []
+    for device in (contextlib.nullcontext(), assumed()):
+        with device, whole_arrays(), Launches() as launches:
+            for kernels in ("_kernels", "_gradient_kernels"):
+                monkeypatch.setattr(triton_step, kernels, launches.kernels)
+            latents = {name: case.latents[kind].clone().requires_grad_(True) for name, kind in which.items()}
+            began = launches.count
+            nodes, edges = step(case.nodes, latents, {name: case.subsets[kind] for name, kind in which.items()})
+            results = [nodes, *edges.values()]
+            torch.autograd.grad(results, [*step.parameters(), *latents.values()], list(map(torch.zeros_like, results)))
+            found.append(launches.count - began - len(results))  # without the zeros
+    plain, fused = found
+    assert fused <= limit
+    assert fused <= plain / 4
 
 
 def test_products_are_as_exact_as_torchs():
