@@ -8,6 +8,7 @@ import collections
 import contextlib
 import functools
 import os
+import statistics
 import subprocess
 import sys
 from dataclasses import replace
@@ -147,16 +148,15 @@ def apart(found: dict[str, Tensor], reference: dict[str, Tensor]) -> float:
 
 
 def assert_equal_gradients(found: dict[str, Tensor], case: Case) -> None:
-    """In float32 those of the plain path, each of them; in bfloat16, where a rounding more opens other ReLUs, at most twice
-    as far from those of float32 as the plain path's are."""
+    """In float32 those of the plain path, each of them; in bfloat16, where a rounding opens other ReLUs, as a whole."""
     reference = gradients_of(case, False, torch.float32)
     if case.latents["mesh"].dtype == torch.bfloat16:
-        assert apart(found, reference) < 2 * apart(gradients_of(case, False), reference)
+        assert apart(found, reference) < 0.15
         return
     assert apart(found, reference) < 1e-6
-    floor = 1e-2 * max(float(x.norm()) for x in reference.values())
+    floor = 0.01 * max(float(x.norm()) for x in reference.values())
     for name, value in reference.items():
-        assert float((found[name] - value).norm()) <= 2e-6 * max(float(value.norm()), floor), name
+        assert float((found[name] - value).norm()) <= 1e-6 * max(float(value.norm()), floor), name
 
 
 def assert_equal_step(result: tuple[Tensor, dict[str, Tensor]], case: Case) -> None:
@@ -251,11 +251,17 @@ def test_gradients_are_those_of_the_plain_path(interpreted, graph, width, dtype)
 def test_latents_and_gradients_of_five_hundred_random_steps(tmp_path):
     results = interpret(tmp_path, "RANDOM", 3600)
     assert len(results) >= 2 * 500
+    shares = []  # how far the kernels' gradients in bfloat16 are from those of float32, by how far the plain path's are
     for key, result in results.items():
-        if key[0] == "gradients":
-            assert_equal_gradients(result, make(*key[1:]))
-        else:
+        if key[0] != "gradients":
             assert_equal_step(result, make(*key))
+            continue
+        case = make(*key[1:])
+        assert_equal_gradients(result, case)
+        if key[3] == "bf16":
+            reference = gradients_of(case, False, torch.float32)
+            shares.append(apart(result, reference) / apart(gradients_of(case, False), reference))
+    assert statistics.median(shares) < 1.1
 
 
 def test_the_graphs_cover_every_kind_of_border():
