@@ -39,6 +39,8 @@ from hood.tensors.precision import assumed
 #: Kernels of an operator that has not one, and how often they read and write what the operator is given.
 STEPS = frame_settings().cg_iterations
 KERNELS = {"torch.ops.hood.step_edges.default": (2, 1), "torch.ops.hood.block_cg.default": (1 + 2 * STEPS, STEPS)}
+#: Operations on a pair of a point and a vertex in the search for the nearest ones.
+PAIR = 20
 #: No matrix of a network has more rows or columns.
 WIDEST = 512
 #: Places for body faces.
@@ -72,10 +74,12 @@ class Frame:
         number, times = KERNELS.get(name, (1, 1))
         moved = int(node.get_read_write_buffers_sizes()) * times
         own = name.startswith("torch.ops.hood.") and times == 1
-        work = matrices(node.node) if own else int(node.estimate_flops() or 0)
+        work, rate = matrices(node.node) if own else int(node.estimate_flops() or 0), device.matmul[self.precision]
+        if name == "torch.ops.hood.nearest_three.default":
+            work, rate = pairs(node.node), device.arithmetic
         self.kernels[name] += number
         self.moved[name] += moved
-        self.seconds += max(number * device.replay, moved / device.bandwidth, work / device.matmul[self.precision])
+        self.seconds += max(number * device.replay, moved / device.bandwidth, work / rate)
 
 
 def matrices(operator: Any) -> int:
@@ -83,6 +87,12 @@ def matrices(operator: Any) -> int:
     shapes = [tuple(int(size) for size in given.get_size()) for given in operator.inputs]
     weights = sum(math.prod(shape) for shape in shapes if len(shape) == 2 and max(shape) <= WIDEST)
     return 2 * max(shape[0] for shape in shapes if shape) * weights
+
+
+def pairs(search: Any) -> int:
+    """Operations of a search for nearest vertices: every pair of a point and a vertex."""
+    points, _, vertices, *_ = (math.prod(int(size) for size in given.get_size()) // 3 for given in search.inputs)
+    return PAIR * points * vertices
 
 
 def schedule(module: torch.fx.GraphModule, inputs: list[torch.Tensor], precision: str = "fp32") -> Frame:

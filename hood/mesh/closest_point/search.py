@@ -19,7 +19,9 @@ from torch import Tensor
 
 from hood.mesh import topology
 from hood.mesh.closest_point import tree as surface_tree
+from hood.mesh.closest_point.vertices import nearest_three
 from hood.tensors.dense import sum_scenes
+from hood.tensors.precision import has_triton
 
 NUM_NEAREST = 3
 #: Scenes up to this many faces, and faces with an edge longer than this many mean edges, are tested
@@ -228,6 +230,8 @@ def _nearest_vertices(
 ) -> tuple[Tensor, Tensor]:
     """The nearest usable vertices of the same scene (N, 3), ascending, and distances (N, 3)."""
     query = torch.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
+    if has_triton(points.device):
+        return nearest_three(query, point_scene, vertices, vertex_scene, usable)
     single = bool((vertex_scene == point_scene[0]).all()) and bool((point_scene == point_scene[0]).all())
     if single and bool(usable.all()):
         return _search_tree(query, vertices)

@@ -22,8 +22,10 @@ from hood.mesh.closest_point.search import (
     span,
     weights_and_offset,
 )
+from hood.mesh.closest_point.vertices import nearest_three
 from hood.tensors.batch import gather_true
 from hood.tensors.dense import is_whole, sum_scenes
+from hood.tensors.precision import has_triton
 
 
 @torch.no_grad()
@@ -77,6 +79,8 @@ def _nearest(
     """The nearest usable vertices of the same scene (N, 3), ascending, and distances (N, 3), infinite where there is none; of
     fewer than three the nearest is repeated."""
     query = torch.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
+    if has_triton(points.device):
+        return nearest_three(query, point_scene, vertices, vertex_scene, usable)
     count = min(NUM_NEAREST, len(vertices))
     index, dist = [], []
     rows = max(1, _pairs_at_once(query) // len(vertices))

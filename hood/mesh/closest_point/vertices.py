@@ -1,11 +1,14 @@
 """Nearest vertices within a radius: the search behind body edges, by a tree on a CPU and by all pairs elsewhere.
 
+The three nearest vertices on a GPU, without a table of all pairs.
+
 Nearest face centroids: the body search of HOOD's published code, kept for comparisons with it.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +19,8 @@ from hood.mesh import geometry
 
 #: Pairs evaluated at once on an accelerator: bounds the memory.
 _CHUNK_PAIRS = 4_000_000
+#: Points of a program of :func:`nearest_three`, vertices that it looks at together, and its warps.
+TILE, CHUNK, WARPS = 64, 64, 8
 
 
 @torch.no_grad()
@@ -59,6 +64,39 @@ def _nearest(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
         # The matrix-product form loses half the digits for points close to the surface.
         parts.append(torch.cdist(chunk, targets, compute_mode="donot_use_mm_for_euclid_dist").min(dim=1))
     return torch.cat([part.indices for part in parts]), torch.cat([part.values for part in parts])
+
+
+@torch.library.custom_op("hood::nearest_three", mutates_args=())
+def nearest_three(
+    points: Tensor, point_scene: Tensor, vertices: Tensor, vertex_scene: Tensor, usable: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The nearest usable vertices (N, 3) of the same scene, ascending, the first of equals first, and distances (N, 3) [m],
+    infinite where there is none; the nearest is then repeated. One kernel, in Triton.
+
+    Args:
+        points: (N, 3) m, finite. The others as in :func:`nearest_vertices`.
+    """
+    index = torch.empty(len(points), 3, dtype=torch.int64, device=points.device)
+    away = points.new_empty(len(points), 3)
+    if len(points):
+        given = (points.contiguous(), point_scene, vertices.contiguous(), vertex_scene, usable, index, away)
+        _kernels().nearest_pass[(-(-len(points) // TILE),)](
+            *given, len(points), len(vertices), TILE=TILE, CHUNK=CHUNK, num_warps=WARPS
+        )
+    return index, away
+
+
+@nearest_three.register_fake
+def _(points: Tensor, point_scene: Tensor, vertices: Tensor, vertex_scene: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.empty(len(points), 3, dtype=torch.int64, device=points.device), torch.empty_like(points)
+
+
+@cache
+def _kernels() -> Any:
+    """The module of the kernel; imports Triton."""
+    from hood.mesh.closest_point import triton_nearest
+
+    return triton_nearest
 
 
 class Nearest(NamedTuple):
