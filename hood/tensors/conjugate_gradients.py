@@ -135,7 +135,7 @@ def block_cg(
     taken anew by whoever needs it, so no two runs differ. Elsewhere in torch, until all scenes are done.
 
     Args:
-        triples: (R, 3) of A, as :class:`hood.solver.system.sparsity.BlockPattern` lays them out.
+        triples: (R, 3) of A in any precision, as :class:`hood.solver.system.sparsity.BlockPattern` lays them out.
         inverse: (N, 3, 3) of its diagonal blocks, symmetric: the preconditioner.
         tolerance: (B,) residual, relative to the right-hand side, both measured by the preconditioner.
         rows: the fields of :class:`BlockRows`.
@@ -172,7 +172,7 @@ def _in_torch(
     degree, scenes = starts.diff(), len(tolerance)
     row = torch.repeat_interleave(torch.arange(len(degree), device=right.device), degree)
     place = torch.arange(len(columns), device=right.device) + 2 * starts[row]
-    blocks = triples[place[:, None] + axes * degree[row, None]]  # (K, 3, 3)
+    blocks = triples[place[:, None] + axes * degree[row, None]].to(right.dtype)  # (K, 3, 3)
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
         return sum_scenes((a * b).sum(dim=1), rows.scene, scenes)

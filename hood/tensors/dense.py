@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+from torch.utils._python_dispatch import _disable_current_modes
 
 #: Bytes of one array of a block: the few in use at a time stay in cache.
 BLOCK_BYTES = 2**20
@@ -156,6 +157,19 @@ _whole = False
 def is_whole() -> bool:
     """Whether :func:`whole_arrays` is in force."""
     return _whole
+
+
+def at_once(x: Tensor) -> bool:
+    """Whether few operations on all of an array are better than many on its rows: on a GPU, whose kernels count, and in what a
+    compiler is given, where every write to a part would be a copy of the whole."""
+    return x.device.type != "cpu" or _whole
+
+
+@cache
+def index_of(values: tuple[int, ...], device: torch.device) -> Tensor:
+    """A table of indices (N,) int64, made once a device, with values while a function is traced as well."""
+    with _disable_current_modes():
+        return torch.tensor(values, device=device)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ CASES = {
     "several": ((40, 1, 90), 0.0, 12, torch.float64),
     "indefinite": ((30, 20), -8.0, 12, torch.float64),
     "float32": ((50,), 0.0, 8, torch.float32),
+    "a matrix in float32": ((60, 30), 0.0, 12, torch.float64),
     "solved before": ((5, 40), 0.0, 20, torch.float64),
     "none": ((20,), 0.0, 0, torch.float64),
 }
@@ -54,6 +55,8 @@ def system(name: str) -> tuple[Tensor, ...]:
         for where in [(pattern.triple_rows, pattern.triple_cols)]
         for whole in (matrix, definite)
     )
+    if name == "a matrix in float32":
+        triples = triples.float()
     inverse = invert_blocks(kept[pattern.diagonal.reshape(-1)].view(-1, 3, 3))
     right = torch.tensor(rng.normal(size=(count, 3)), dtype=dtype)
     scene = torch.as_tensor(np.repeat(np.arange(len(sizes)), sizes))

@@ -18,7 +18,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.bending import HingeForm, bending_weight
 from hood.energies.membrane import isotropic_density, isotropic_stress, weave_density, weave_roots, weave_stress
-from hood.tensors.dense import is_whole
+from hood.tensors.dense import at_once, index_of, is_whole
 
 #: As in hood.mesh.geometry: a triangle is degenerate when a sine in it is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
@@ -111,7 +111,7 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
     Args:
         x: (3, 3, N) m, of corner and axis.
         num_corners: C, leading corners by which to differentiate.
-        out: storage of the result's ``matrix``.
+        out: storage of the result's ``matrix``; not used where that is found at once (:func:`hood.tensors.dense.at_once`).
     """
     f0, f1, (g00, g01, g11) = _strain(x, constants.shape)
     b, mu = constants.shape[:, :num_corners], constants.lame_mu
@@ -130,9 +130,12 @@ def face_model(x: Tensor, constants: FaceConstants, num_corners: int = 3, out: T
     else:
         first, coupled, second, turn = weight.sqrt() * constants.weave
         roots = [first * along + coupled * across, second * across, turn * shear]
-    matrix = _outer_sum(roots, out)
     axial = _symmetric(tension, b)
-    _add_axial(matrix, axial, num_corners)
+    if at_once(x):
+        matrix = _all_at_once(roots, axial, num_corners)
+    else:
+        matrix = _outer_sum(roots, out)
+        _add_axial(matrix, axial, num_corners)
     return FaceModel(gradient, matrix, _symmetric(pull, b) - axial)
 
 
@@ -183,6 +186,29 @@ def _outer_sum(roots: list[Tensor], out: Tensor | None) -> Tensor:
     for row in rows[1:]:
         outer_upper(row, result, add=True)
     return result
+
+
+def _all_at_once(roots: list[Tensor], axial: Tensor, num_corners: int) -> Tensor:
+    """The matrix of :func:`face_model` without writing twice to a place."""
+    size, place = 3 * num_corners, 0
+    table = [len(axial)] * (size * (size + 1) // 2)  # of most entries a row of zeros
+    for j in range(num_corners):
+        for k in range(j, num_corners):
+            for row in range(3 * j, 3 * j + 3):
+                table[row * size - row * (row - 1) // 2 + 3 * (k - j)] = place
+            place += 1
+    padded = torch.cat([axial, torch.zeros_like(axial[:1])])
+    matrix = padded.index_select(0, index_of(tuple(table), axial.device))
+    for root in roots:
+        matrix = matrix + upper_of_products(root.flatten(0, 1))
+    return matrix
+
+
+def upper_of_products(row: Tensor) -> Tensor:
+    """Upper triangles (K (K + 1) / 2, N) of the products rowᵀ row of ``row`` (K, N), in two gathers and a product."""
+    pairs = [(i, j) for i in range(len(row)) for j in range(i, len(row))]
+    first, second = (index_of(tuple(pair[side] for pair in pairs), row.device) for side in range(2))
+    return row.index_select(0, first) * row.index_select(0, second)
 
 
 def outer_upper(row: Tensor, out: Tensor, add: bool = False) -> None:
@@ -337,8 +363,11 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
+    axes = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    if at_once(a):
+        return torch.stack([torch.addcmul(a[j] * b[k], a[k], b[j], value=-1) for _, j, k in axes])
     result = torch.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    for i, j, k in axes:
         torch.mul(a[j], b[k], out=result[i])
         result[i].addcmul_(a[k], b[j], value=-1)
     return result

@@ -136,6 +136,11 @@ class ModelBuilder:
 
     def __call__(self, pos: Tensor, acc: Tensor) -> QuadraticModel:
         """The model at ``pos`` (V, 3) reached with ``acc`` (V, 3)."""
+        assemble = self._at_once if self.plan.matrix.by_index_alone(pos) else self._in_parts
+        return self._with_points(*assemble(pos, acc), pos, acc)
+
+    def _in_parts(self, pos: Tensor, acc: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradient of single vertices and elements, and the entries of their matrices; in the memory of this object."""
         terms, plan = self.terms, self.plan
         vertices = terms.vertex_model(pos, acc)
         gradient = vertices.gradient
@@ -153,9 +158,35 @@ class ModelBuilder:
         if springs is not None:
             gradient = gradient + plan.attachment_vertices(springs[0]).view(-1, 3)
             self._springs.copy_(springs[1].view(-1))
+        return gradient, self._values, self._slack
+
+    def _at_once(self, pos: Tensor, acc: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same without writing to a part of anything."""
+        terms, plan = self.terms, self.plan
+        vertices = terms.vertex_model(pos, acc)
+        gradient, slack = vertices.gradient, vertices.indefinite_part
+        values = [vertices.matrix, self._faces, self._hinges, self._springs]
+        slacks = [self._vertex_slack if slack is None else slack, self._face_slack]
+        faces = terms.faces(pos)
+        if faces is not None:
+            gradient = gradient + plan.face_vertices(faces.gradient).view(-1, 3)
+            values[1], slacks[1] = faces.matrix, faces.indefinite_part
+        for index, (slope, row) in enumerate(terms.hinges(pos)):
+            gradient = gradient + plan.hinge_vertices(slope).view(-1, 3)
+            products = elements.upper_of_products(row.flatten(0, 1))
+            values[2] = products if index == 0 else values[2] + products
+        springs = terms.attachments(pos)
+        if springs is not None:
+            gradient = gradient + plan.attachment_vertices(springs[0]).view(-1, 3)
+            values[3] = springs[1]
+        return gradient, torch.cat([one.reshape(-1) for one in values]), torch.cat([one.reshape(-1) for one in slacks])
+
+    def _with_points(self, gradient: Tensor, values: Tensor, slack: Tensor, pos: Tensor, acc: Tensor) -> QuadraticModel:
+        """The model, with points inside faces and what other terms add."""
+        terms, plan = self.terms, self.plan
         other = terms.other_gradient(pos, acc)
         gradient = gradient if other is None else gradient + other
-        triples, indefinite_part = plan.matrix(self._values).view(-1, 3), plan.indefinite_part(self._slack).view(-1, 3)
+        triples, indefinite_part = plan.matrix(values).view(-1, 3), plan.indefinite_part(slack).view(-1, 3)
         for points, blocks in zip(terms.points, self._blocks, strict=True):
             model = points.model(pos)
             gradient = gradient + points.spread(model.gradient, gradient)

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from hood.tensors.dense import is_whole, sum_rows
+from hood.tensors.dense import at_once, sum_rows
 
 
 def row_product(data: Tensor, cols: np.ndarray, starts: np.ndarray, width: int) -> Callable[[Tensor], Tensor]:
@@ -50,12 +50,17 @@ class Scatter:
 
     def __call__(self, values: Tensor) -> Tensor:
         """(M,) sums of ``values``, any shape with N entries."""
-        if values.device.type != "cpu" or is_whole():
+        if self.by_index_alone(values):
             return self.by_index(values)
         if values.dtype not in self._products:
             ones = torch.ones(len(self._source), dtype=values.dtype)
             self._products[values.dtype] = row_product(ones, *self._structure)
         return self._products[values.dtype](values.reshape(-1))
+
+    @staticmethod
+    def by_index_alone(values: Tensor) -> bool:
+        """Whether entries like these are summed by :meth:`by_index`, where writing them part by part does not pay either."""
+        return at_once(values)
 
     def by_index(self, values: Tensor) -> Tensor:
         """The same in torch operations, on any device."""

@@ -83,6 +83,7 @@ class NewtonFrame(Pieces):
 
     def _solve_all(self) -> None:
         """The Newton direction of the positive matrix alone: it never has to be asked for another one."""
-        triples = self._idle(self._model.triples, self._active)
+        # In half the bytes, as on a CPU: every iteration reads the matrix, whose rounding turns the direction by 1e-7.
+        triples = self._idle(self._model.triples, self._active).float()
         rows, most = list(self._rows), self._cg_iterations
         self._solution.copy_(block_cg(triples, self._inverse, self._rhs, self._tolerance, rows, most)[0])
