@@ -165,9 +165,15 @@ def at_once(x: Tensor) -> bool:
     return x.device.type != "cpu" or _whole
 
 
-@cache
 def index_of(values: tuple[int, ...], device: torch.device) -> Tensor:
     """A table of indices (N,) int64, made once a device, with values while a function is traced as well."""
+    if device.type == "meta":  # tensors without values, to count what is done with them
+        return torch.empty(len(values), dtype=torch.int64, device=device)
+    return _index_of(values, device)
+
+
+@cache
+def _index_of(values: tuple[int, ...], device: torch.device) -> Tensor:
     with _disable_current_modes():
         return torch.tensor(values, device=device)
 
