@@ -39,6 +39,7 @@ from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene, dress
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
+from hood.steppers.static_shapes.cuda_graph import has_graphs
 from hood.steppers.static_shapes.simulator import MODES, CapturedSimulator, network_of
 from hood.steppers.watched import WatchedStepper
 from hood.tensors.precision import PRECISIONS, TF32
@@ -198,7 +199,7 @@ def _by_itself(stepper: Stepper, config: RolloutSettings) -> tuple[Stepper, Roll
     ones."""
     if str(config.step) != AUTO:
         return stepper, config
-    if torch.device(str(config.device)).type == "cuda" and isinstance(stepper, NetworkStepper) and chosen(config) is None:
+    if isinstance(stepper, NetworkStepper) and has_graphs(stepper.gravity.device) and chosen(config) is None:
         asked = config.with_values(step="captured")
         try:
             check_config(asked)

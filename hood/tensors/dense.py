@@ -102,7 +102,7 @@ def add_rows(target: Tensor, index: Tensor, rows: Tensor) -> Tensor:
 
     A GPU adds at an index as it comes, and two runs differ in their last bits; so the rows are sorted by it there.
     """
-    if target.device.type == "cpu" and not _whole:
+    if not at_once(target):
         return target.index_add(0, index, rows)
     order, offsets = _by_index(index, len(target))
     width = math.prod(target.shape[1:])
@@ -122,7 +122,7 @@ class RowSums:
     def __init__(self, index: Tensor, chosen: Tensor, count: int) -> None:
         self._index, self._chosen, self._count = index, chosen, count
         self._offsets: Tensor | None = None
-        if index.device.type != "cpu" or _whole:
+        if at_once(index):
             order, self._offsets = _by_index(index, count)
             self._chosen = chosen[order]
 
@@ -143,7 +143,7 @@ def sum_scenes(values: Tensor, scene: Tensor, num_scenes: int) -> Tensor:
 
     On a GPU that takes B × N numbers for a moment: adding at an index would take N, and other bits in every run.
     """
-    if values.device.type == "cpu" and not _whole:
+    if not at_once(values):
         return values.new_zeros(num_scenes).index_add(0, scene, values)
     if num_scenes == 1:  # one kernel
         return values.sum().reshape(1)
@@ -193,7 +193,7 @@ def whole_arrays() -> Iterator[None]:
 def blocks(x: Tensor) -> Iterator[slice]:
     """Rows of ``x`` (N, d) in blocks; a GPU gets everything at once."""
     count = x.shape[0]
-    if x.device.type == "cpu" and not _whole:
+    if not at_once(x):
         rows = max(BLOCK_BYTES // (x.shape[1] * x.element_size()) // UNIT * UNIT, UNIT)
     else:
         rows = max(count, 1)
@@ -211,7 +211,7 @@ def padded_count(count: int) -> int:
 
 def wants_padding(x: Tensor) -> bool:
     """Whether products of ``x`` want numbers of rows rounded up: all but those of MKL, which takes any."""
-    return x.device.type != "cpu" or _whole or _kernel(x.device.type, x.dtype) is not None
+    return at_once(x) or _kernel(x.device.type, x.dtype) is not None
 
 
 def pad_rows(x: Tensor) -> Tensor:

@@ -4,10 +4,7 @@ Triton decides at its import whether it interprets, so the kernels run in a proc
 computes all cases and writes what came out.
 """
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +15,7 @@ from hood.solver.system.linear import invert_blocks
 from hood.solver.system.sparsity import BlockPattern
 from hood.tensors import conjugate_gradients as block_cg
 from hood.tensors.precision import assumed
+from tests.interpreted import interpret
 
 #: Rows of the scenes, shift of the second half of the scenes' matrices (negative: indefinite), iterations, number.
 CASES = {
@@ -69,16 +67,6 @@ def solve(name: str) -> tuple[Tensor, Tensor]:
     return block_cg.block_cg(triples, inverse, right, tolerance, rows, {**CASES, **RANDOM}[name][2])
 
 
-def interpret(tmp_path: Path, what: str, seconds: int) -> dict[str, tuple[Tensor, Tensor]]:
-    pytest.importorskip("triton", reason="Triton is built for Linux only")
-    root = str(Path(__file__).parents[2])
-    search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": search}
-    command = [sys.executable, __file__, what, str(tmp_path / "results.pt")]
-    subprocess.run(command, check=True, env=environment, timeout=seconds)
-    return torch.load(tmp_path / "results.pt")
-
-
 def assert_same(found: tuple[Tensor, Tensor], name: str) -> None:
     x, indefinite = solve(name)
     bound = 1e-10 if x.dtype == torch.float64 else 1e-4
@@ -87,7 +75,7 @@ def assert_same(found: tuple[Tensor, Tensor], name: str) -> None:
 
 
 def test_kernels_find_what_the_host_finds(tmp_path):
-    results = interpret(tmp_path, "CASES", 300)
+    results = interpret(__file__, "CASES", tmp_path, 300)
     for name in CASES:
         assert_same(results[name], name)
     assert results["indefinite"][1].tolist() == [0, 1]
@@ -96,7 +84,7 @@ def test_kernels_find_what_the_host_finds(tmp_path):
 
 @pytest.mark.slow
 def test_five_hundred_random_systems(tmp_path):
-    results = interpret(tmp_path, "RANDOM", 3600)
+    results = interpret(__file__, "RANDOM", tmp_path, 3600)
     assert len(results) == 500
     for name in RANDOM:
         assert_same(results[name], name)

@@ -47,6 +47,8 @@ _REASON = 300
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
+#: Values of ``step`` that do not ask for steps of fixed shapes.
+NOT_FIXED = ("plain", "auto")
 #: Keys that people look for under another word.
 _OTHER_WORDS = {
     "motion": ("sequence", "sequences"),
@@ -95,8 +97,7 @@ def named_today(words: Sequence[str], command: str = "rollout") -> tuple[str, ..
 def with_network(words: Sequence[str]) -> tuple[str, ...]:
     """The words of a rollout; ``stepper=network`` among them where it is left to ``auto`` and one is about a network alone."""
     said = {word.partition("=")[0].lstrip("+"): word.partition("=")[2] for word in words}
-    fixed = said.get("step", "auto") not in ("plain", "auto")
-    means = fixed or any(key.split(".")[0] in (*NETWORK_KEYS, "refine") for key in said)
+    means = said.get("step", "auto") not in NOT_FIXED or any(key.split(".")[0] in (*NETWORK_KEYS, "refine") for key in said)
     return (*words, "stepper=network") if means and said.get("stepper", "auto") == "auto" else tuple(words)
 
 

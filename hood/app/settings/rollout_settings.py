@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from hood.app.settings.compose import ConfigError, brief, load_config, plain, with_words
+from hood.app.settings.compose import NOT_FIXED, ConfigError, brief, load_config, plain, with_words
 from hood.rollouts.verdict.surface import SURFACE_STRIDE
 
 
@@ -187,7 +187,7 @@ _KINDS: dict[type, tuple[tuple[type, ...], str]] = {
 
 def fixed_shapes(config: Mapping[Any, Any]) -> bool:
     """Whether ``step`` asks for steps of fixed shapes; ``auto`` takes them only where nothing speaks against it."""
-    return str(config["step"]) not in ("plain", "auto")
+    return str(config["step"]) not in NOT_FIXED
 
 
 def refinement(config: Mapping[Any, Any]) -> Refinement:

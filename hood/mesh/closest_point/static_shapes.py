@@ -24,7 +24,7 @@ from hood.mesh.closest_point.search import (
 )
 from hood.mesh.closest_point.vertices import nearest_three
 from hood.tensors.batch import gather_true
-from hood.tensors.dense import is_whole, sum_scenes
+from hood.tensors.dense import at_once, sum_scenes
 from hood.tensors.precision import has_triton
 
 
@@ -98,7 +98,7 @@ def _nearest(
 
 def _pairs_at_once(points: Tensor) -> int:
     """How many distances are in memory together: 16 MB of them in the cache of a CPU, 512 MB and few kernels on a GPU."""
-    return CHUNK_PAIRS if points.device.type == "cpu" and not is_whole() else 32 * CHUNK_PAIRS
+    return 32 * CHUNK_PAIRS if at_once(points) else CHUNK_PAIRS
 
 
 def _exhaustive(

@@ -17,7 +17,7 @@ from hood.energies.problem import sum_per_scene
 from hood.solver.derivatives.self_contact import LayerRows
 from hood.solver.system.plan import QuadraticModel, SolverPlan
 from hood.solver.system.sparsity import BlockPattern, row_product
-from hood.tensors.dense import is_whole, sum_rows
+from hood.tensors.dense import at_once, sum_rows
 
 #: Below this share of the indefinite part the next try does without.
 LEAST_SHARPNESS = 0.2
@@ -140,7 +140,7 @@ class BandLayout:
 
 def product(pattern: BlockPattern, triples: Tensor) -> Callable[[Tensor], Tensor]:
     """x (N, 3) → H x (N, 3)."""
-    if triples.device.type != "cpu" or is_whole():
+    if at_once(triples):
         return block_product(pattern, triples)
     apply = row_product(triples.reshape(-1), pattern.indices, pattern.indptr, 3 * pattern.size)
     return lambda x: apply(x.reshape(-1)).view(-1, 3)

@@ -23,6 +23,11 @@ Run = Callable[..., tuple[Tensor, ...]]
 _WARM_UP = 3
 
 
+def has_graphs(device: torch.device) -> bool:
+    """Whether the kernels of a function can be recorded there, to be started by one call."""
+    return device.type == "cuda"
+
+
 class InputMemory:
     """Memory of a function's inputs, written only where a value has changed since the last time."""
 

@@ -20,7 +20,7 @@ from hood.solver.system.iterate import rounded
 from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
-from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, trace
+from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
 from hood.steppers.static_shapes.newton_frame import NewtonFrame
 from hood.steppers.static_shapes.newton_pieces import FixedSystem, MaskedStep
 from hood.steppers.static_shapes.problem import (
@@ -61,7 +61,7 @@ class CapturedNewton:
     def __init__(self, stepper: NewtonStepper, mode: str = "captured") -> None:
         if mode not in _MODES:
             raise ValueError(f"step={mode} is none of the solver's; choose plain, {' or '.join(_MODES)}")
-        if mode == "captured" and stepper.gravity.device.type != "cuda":
+        if mode == "captured" and not has_graphs(stepper.gravity.device):
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
         if stepper.settings.linear != "cg":
             raise ValueError(f"solver.linear={stepper.settings.linear} has no form of fixed shapes; use cg or step=plain")
@@ -149,7 +149,7 @@ class _Frame(_Fixed):
             NewtonFrame(*given)(*memory)  # what is made once per cloth is made now: a trace has no values for it
         frame = NewtonFrame(*given, dense=True)
         self._run: Run = torch.compile(trace(frame, memory), fullgraph=True, dynamic=False)
-        if memory[0].device.type == "cuda":
+        if has_graphs(memory[0].device):
             self._run = CudaGraph(self._run, memory)
 
     def enter(self, problem: StepProblem) -> int:

@@ -30,7 +30,7 @@ from hood.steppers.network import NetworkStepper, Prediction, Prepared
 from hood.steppers.newton import Stepper
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
 from hood.steppers.refined import unrefined
-from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, trace
+from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
 from hood.steppers.static_shapes.problem import (
     Constants,
     altered,
@@ -184,7 +184,7 @@ class CapturedSimulator:
     ) -> None:
         if mode not in MODES:
             raise ValueError(f"step is {mode!r}; choose plain, {', '.join(MODES[:-1])} or {MODES[-1]}")
-        if mode == "captured" and simulator.gravity.device.type != "cuda":
+        if mode == "captured" and not has_graphs(simulator.gravity.device):
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
         if mode == "compiled" and simulator.network.kernels != "torch":
             raise ValueError("step=compiled compiles torch's operations and needs kernels=torch; or use step=plain")
@@ -294,7 +294,7 @@ class _Plan:
             run = trace(run, memory)
         if mode == "compiled":
             run = torch.compile(run, fullgraph=True, dynamic=False)
-        if mode != "fixed" and memory[0].device.type == "cuda":
+        if mode != "fixed" and has_graphs(memory[0].device):
             with products(self._precision):
                 run = CudaGraph(run, memory)
         self._run = run

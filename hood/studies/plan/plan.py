@@ -22,7 +22,7 @@ from hood.app.plan_file import FREE, content_digest, key_of, plan_accuracy, read
 from hood.app.settings.compose import ConfigError, load_config, named_today, plain, with_words
 from hood.app.settings.overrides import plain_word
 from hood.app.settings.python_words import overrides as overrides_of
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.assets.files.library import locate
 from hood.native.build import cache_folder, processor
@@ -113,6 +113,8 @@ def make_plan(words: list[str], own: DictConfig, evidence: bool = True) -> tuple
     """
     config, tolerance, budget = _check(words, own)
     began, spent = time.perf_counter(), time.process_time()
+    if not fixed_shapes(config):  # what is compared with this one has other shapes
+        config = config.with_values(step="plain")
     ready = set_up(config, make_stepper(config)[0])
     frames = _frames(own, tolerance, budget, min(int(ready.config.num_frames), ready.scene.num_frames))
     asked = AskedOf(tolerance, budget, [str(name) for name in own.parts], int(own.windows), frames, evidence=evidence)

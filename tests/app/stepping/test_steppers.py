@@ -99,6 +99,7 @@ def test_a_gpu_takes_a_network_alone_as_a_graph(words: list[str], step: str, mon
 
     monkeypatch.setattr(setup, "CapturedSimulator", capture)
     monkeypatch.setattr(setup, "require_device", lambda config: None)
+    monkeypatch.setattr(setup, "has_graphs", lambda device: "device=cuda" in words)
     network = build_simulator("paper", "acceleration", "1x(mesh)", latent_dim=8).eval()
     stepper, config = setup._by_itself(network, RolloutSettings.from_words(["stepper=network", *words]))
     assert str(config.step) == step

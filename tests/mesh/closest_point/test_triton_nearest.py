@@ -4,10 +4,7 @@ Triton decides at its import whether it interprets, so the kernel runs in a proc
 all cases and writes what came out.
 """
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +13,7 @@ from torch import Tensor
 
 from hood.mesh.closest_point import static_shapes, vertices
 from hood.tensors.precision import assumed
+from tests.interpreted import interpret
 from tests.spills import CAPABILITIES, LEAST, spilled
 
 #: Points and vertices of each scene, and the precision.
@@ -63,16 +61,6 @@ def by_order(name: str) -> tuple[Tensor, Tensor]:
     return torch.where(torch.isinf(away), index[:, :1], index), away.sqrt()
 
 
-def interpret(tmp_path: Path, what: str, seconds: int) -> dict[str, tuple[Tensor, Tensor]]:
-    pytest.importorskip("triton", reason="Triton is built for Linux only")
-    root = str(Path(__file__).parents[3])
-    search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": search}
-    command = [sys.executable, __file__, what, str(tmp_path / "results.pt")]
-    subprocess.run(command, check=True, env=environment, timeout=seconds)
-    return torch.load(tmp_path / "results.pt")
-
-
 def assert_same(found: tuple[Tensor, Tensor], name: str) -> None:
     index, away = by_order(name)
     there = torch.isfinite(away)
@@ -84,7 +72,7 @@ def assert_same(found: tuple[Tensor, Tensor], name: str) -> None:
 
 
 def test_one_kernel_finds_what_all_pairs_have(tmp_path):
-    results = interpret(tmp_path, "CASES", 300)
+    results = interpret(__file__, "CASES", tmp_path, 300)
     for name in CASES:
         assert_same(results[name], name)
     assert not torch.isfinite(results["no vertex of its scene"][1][10:]).any()
@@ -92,7 +80,7 @@ def test_one_kernel_finds_what_all_pairs_have(tmp_path):
 
 @pytest.mark.slow
 def test_five_hundred_random_queries(tmp_path):
-    results = interpret(tmp_path, "RANDOM", 3600)
+    results = interpret(__file__, "RANDOM", tmp_path, 3600)
     assert len(results) == 500
     for name in RANDOM:
         assert_same(results[name], name)

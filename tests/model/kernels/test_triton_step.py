@@ -7,12 +7,9 @@ computes all cases and writes what came out.
 import collections
 import contextlib
 import functools
-import os
 import statistics
-import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -29,6 +26,7 @@ from hood.steppers.static_shapes.cuda_graph import VIEWS
 from hood.tensors import precision as triton_device
 from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import assumed, products
+from tests.interpreted import interpret
 
 TILE = 32  # of the widest tiles
 BOUND = {torch.float32: 2e-6, torch.bfloat16: 0.015}
@@ -221,20 +219,9 @@ def test_networks_beside_the_steps_are_those_of_the_plain_path(interpreted, widt
         assert float((result.float() - reference).norm() / reference.norm()) < bound
 
 
-def interpret(tmp_path: Path, what: str, seconds: int) -> dict[tuple[str, int, str], tuple[Tensor, dict[str, Tensor]]]:
-    """Results of cases by the interpreter."""
-    pytest.importorskip("triton", reason="Triton is built for Linux only")
-    path = tmp_path / "results.pt"
-    root = str(Path(__file__).parents[3])
-    search = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": search}
-    subprocess.run([sys.executable, __file__, what, str(path)], check=True, env=environment, timeout=seconds)
-    return torch.load(path)
-
-
 @pytest.fixture(scope="module")
 def interpreted(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int, str], tuple[Tensor, dict[str, Tensor]]]:
-    return interpret(tmp_path_factory.mktemp("triton"), "CASES", 300)
+    return interpret(__file__, "CASES", tmp_path_factory.mktemp("triton"), 300)
 
 
 @pytest.mark.parametrize("graph, width, dtype", CASES)
@@ -249,7 +236,7 @@ def test_gradients_are_those_of_the_plain_path(interpreted, graph, width, dtype)
 
 @pytest.mark.slow
 def test_latents_and_gradients_of_five_hundred_random_steps(tmp_path):
-    results = interpret(tmp_path, "RANDOM", 3600)
+    results = interpret(__file__, "RANDOM", tmp_path, 3600)
     assert len(results) >= 2 * 500
     shares = []  # how far the kernels' gradients in bfloat16 are from those of float32, by how far the plain path's are
     for key, result in results.items():
