@@ -119,6 +119,11 @@ class Cloth:
         return ~self.pinned & (self.mass > 0)
 
     @cached_property
+    def has_pinned(self) -> bool:
+        """Whether a vertex is pinned; waits for the device once."""
+        return bool(self.pinned.any())
+
+    @cached_property
     def scene_sizes(self) -> tuple[int, ...]:
         """Vertices of every scene, known to the host; waits for the device once, and only where there are several scenes."""
         if self.num_scenes == 1:

@@ -247,6 +247,6 @@ def relative_gradient(problem: StepProblem, gradient: Tensor) -> Tensor:
     return torch.where(movable, (force_sq / torch.where(movable, weight_sq, 1.0)).sqrt(), 0.0)
 
 
-def _gravity_norm(problem: StepProblem) -> float:
-    norm = float(problem.gravity.norm())
-    return norm if norm > 0 else STANDARD_GRAVITY
+def _gravity_norm(problem: StepProblem) -> Tensor:
+    norm = problem.gravity.norm()
+    return torch.where(norm > 0, norm, STANDARD_GRAVITY)

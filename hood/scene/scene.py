@@ -21,7 +21,7 @@ from hood.scene.start import free_stretch, leave_by_centroids, settle
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 from hood.scene.worn import worst_part
 from hood.tensors.batch import to_device
-from hood.tensors.dense import add_rows
+from hood.tensors.dense import add_rows, sum_scenes
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
@@ -198,7 +198,7 @@ class Scene:
         origin = state.origin[0].numpy()
         pins = None
         cloth = self.cloth if self.holding is None or relaxing else self.holding.cloth(self.cloth, frame)
-        if bool(cloth.pinned.any()):
+        if cloth.has_pinned:
             pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
             if self.holding is not None and not relaxing and not jumping:
                 here = self.motion.skinned(self.garment, frame, origin)
@@ -283,13 +283,15 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
 
 def recentre(state: State, vertex_scene: Tensor) -> State:
     """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
-    count = torch.bincount(vertex_scene, minlength=len(state.origin)).clamp_min(1)
+    like = state.pos.new_ones(len(vertex_scene))
+    count = sum_scenes(like, vertex_scene, len(state.origin)).clamp_min(1)
     centre = add_rows(state.pos.new_zeros(len(state.origin), 3), vertex_scene, state.pos) / count[:, None]
     # A broken cloth has no centre; its frame stays, so that the body can still be seen.
     shift = torch.round(centre.nan_to_num(0.0, 0.0, 0.0) / (2 * _GRID)) * (2 * _GRID)
-    if not bool(shift.any()):
+    known = shift.cpu()  # waits for the device, once
+    if not bool(known.any()):
         return state
-    return State(state.pos - shift[vertex_scene], state.vel, state.origin + shift.cpu().to(torch.float64))
+    return State(state.pos - shift[vertex_scene], state.vel, state.origin + known.to(torch.float64))
 
 
 def local_origin(position: np.ndarray, grid: float = _GRID) -> np.ndarray:

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
@@ -30,13 +31,13 @@ from hood.energies.problem import StepProblem
 CONSTANT = 1e-3
 
 
-def output_spread(acc: Tensor, free: Tensor) -> float:
+def output_spread(acc: Tensor, free: Tensor) -> Tensor:
     """How much of the accelerations (V, 3) differs between the vertices that are ``free`` (V,): the root of the mean square of
-    what deviates from their mean, over that of all. 1 where all are zero."""
+    what deviates from their mean, over that of all, (). 1 where all are zero."""
     rows = free.unsqueeze(1).to(acc)
     mean = (acc * rows).sum(dim=0) / rows.sum().clamp_min(1.0)
-    all_of_it = float((acc * rows).norm())
-    return float(((acc - mean) * rows).norm()) / all_of_it if all_of_it > 0 else 1.0
+    all_of_it = (acc * rows).norm()
+    return torch.where(all_of_it > 0, ((acc - mean) * rows).norm() / torch.where(all_of_it > 0, all_of_it, 1.0), 1.0)
 
 
 class ConstantOutput:

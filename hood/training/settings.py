@@ -162,6 +162,10 @@ def make_whitening(simulator: NetworkStepper, on: bool) -> Whitening:
     return Whitening(layers, encoders, columns, fresh)
 
 
+#: How an update is computed: operation by operation, with fixed shapes, or as a CUDA graph of them; by itself the last.
+STEPS = ("auto", "plain", "fixed", "captured")
+
+
 @dataclass(frozen=True)
 class TrainerSettings:
     """How a model is trained; defaults are the paper's where it speaks and the reference's where it is silent.
@@ -185,6 +189,7 @@ class TrainerSettings:
     train fastest here, :mod:`hood.model.network.kernel_choice`.
     ``time_scale``: factor on the whole schedule, see :meth:`compressed`. ``max_vertices``: batches of garments of similar size,
     :mod:`hood.training.slots`. ``workers``: processes that make scenes ahead, None for one per idle core.
+    ``step``: how an update is computed, :class:`hood.training.updates.CapturedUpdates`.
     ``activation_checkpointing``: keep the latents between processor steps only and compute the rest again when it is needed.
     """
 
@@ -215,12 +220,15 @@ class TrainerSettings:
     max_vertices: int | None = None
     workers: int | None = 0
     activation_checkpointing: bool = False
+    step: str = "auto"
 
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
             raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
         if self.kernels not in (AUTO, *KERNELS):
             raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
+        if self.step not in STEPS:
+            raise ValueError(f"trainer.step {self.step!r}: give {' or '.join(map(repr, STEPS))}")
         if self.optimizer not in OPTIMIZERS:
             raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
         if self.signal not in SIGNALS:

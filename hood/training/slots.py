@@ -5,9 +5,10 @@ Garments by size: a batch holds scenes of similar size, and as many of them as a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from hood.cloth.state import State, StepInput, concatenate_states, concatenate_s
 from hood.scene.scene import RELAXING_DT, recentre
 from hood.solver.step_figures import edge_strain
 from hood.steppers.network import NetworkStepper, Prepared
+from hood.tensors.dense import sum_scenes
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
 from hood.training.scenes import SceneSampler, Window
 
@@ -84,6 +86,16 @@ RELAXED_VELOCITIES = ("skinned", "own", "zero")
 TORN_STRAIN = 1.5
 
 
+class Part(NamedTuple):
+    """Scenes of an update and the step that they take."""
+
+    cloth: Cloth
+    prepared: Prepared
+    state: State
+    step: StepInput
+    kind: tuple[int, bool] | None = None  # template, and whether mirrored: what the topology of a scene alone depends on
+
+
 @dataclass
 class _Slot:
     bucket: int
@@ -145,35 +157,45 @@ class Slots:
         self.feed = SceneFeed(sampler, choose_workers(workers, len(self._slots)))
 
     @property
+    def ending_strain(self) -> float:
+        """Strain at which a rollout ends, see :func:`is_lost`."""
+        return math.inf if self.whole else self.torn_strain
+
+    @property
     def num_slots(self) -> int:
         """Rollouts of all buckets, over all processes."""
         return self.buckets[-1].first + self.buckets[-1].count
 
-    def batch(self, horizon: int) -> tuple[Cloth, Prepared, State, StepInput]:
+    def batch(self, horizon: int) -> Part:
         """The current problems as one flat batch; slots past ``horizon`` steps after the relaxing one start a scene first."""
-        number, slots = self._current()
+        parts, number = self.each(horizon), self._current()[0]
+        counts = [part.cloth.num_vertices for part in parts]
+        if number not in self._batches:
+            cloth = concatenate_cloths([part.cloth for part in parts])
+            self._batches[number] = (cloth, self.simulator.concatenate(cloth, [part.prepared for part in parts], counts))
+        states, steps = [part.state for part in parts], [part.step for part in parts]
+        return Part(*self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts))
+
+    def each(self, horizon: int) -> list[Part]:
+        """The current problems as in :meth:`batch`, every scene alone."""
+        slots = self._current()[1]
         for index, slot in slots.items():
             # Step 0 is the relaxing step; ``horizon`` regular steps follow it.
             if slot.window is None or slot.age > (horizon if slot.length is None else slot.length):
                 self._reset(index, slot, horizon)
-        states, steps, counts = [], [], []
-        for slot in slots.values():
-            assert slot.window is not None
-            assert slot.state is not None
-            scene, first = slot.window.scene, slot.age == 0
-            slot.state = recentre(slot.state, scene.cloth.vertex_scene)
-            frame = slot.window.start_frame + max(slot.age - 1, 0)
-            states.append(slot.state)
-            step = scene.step_input(frame, slot.state, relaxing=first)
-            if first and slot.still:
-                step = replace(step, dt=torch.full_like(step.dt, scene.dt))
-            steps.append(step)
-            counts.append(scene.cloth.num_vertices)
-        if number not in self._batches:
-            cloth = concatenate_cloths([slot.window.scene.cloth for slot in slots.values()])  # type: ignore[union-attr]
-            prepared = self.simulator.concatenate(cloth, [slot.prepared for slot in slots.values()], counts)  # type: ignore[misc]
-            self._batches[number] = (cloth, prepared)
-        return *self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts)
+        return [self._part(slot) for slot in slots.values()]
+
+    def _part(self, slot: _Slot) -> Part:
+        window, prepared = slot.window, slot.prepared
+        assert window is not None
+        assert prepared is not None
+        assert slot.state is not None
+        scene, first = window.scene, slot.age == 0
+        slot.state = recentre(slot.state, scene.cloth.vertex_scene)
+        step = scene.step_input(window.start_frame + max(slot.age - 1, 0), slot.state, relaxing=first)
+        if first and slot.still:
+            step = replace(step, dt=torch.full_like(step.dt, scene.dt))
+        return Part(scene.cloth, prepared, slot.state, step, (window.template, window.mirrored))
 
     def skinned_accelerations(self) -> Tensor:
         """(V, 3) m per frame² of the batch's skinned garments at their current frames: the scale of the paper's output."""
@@ -183,25 +205,27 @@ class Slots:
             parts.append(slot.window.scene.skinned_acceleration(slot.window.start_frame + max(slot.age - 1, 0)))
         return torch.cat(parts)
 
-    def advance(self, next_pos: Tensor, next_vel: Tensor) -> None:
-        """Take the predicted positions (V, 3) and velocities (V, 3) over, detached; broken rollouts end here.
+    def advance(self, next_pos: Tensor, next_vel: Tensor, lost: Sequence[bool] | None = None) -> None:
+        """Take the predicted positions (V, 3) and velocities (V, 3) over; rollouts that are lost end here.
+
+        Args:
+            lost: what :func:`is_lost` says of the positions, where that is known.
 
         The turn passes on to the next bucket.
         """
         number, slots = self._current()
         offset = 0
-        for slot in slots.values():
+        for place, slot in enumerate(slots.values()):
             assert slot.window is not None
             assert slot.state is not None
-            scene = slot.window.scene
-            rows = slice(offset, offset + scene.cloth.num_vertices)
+            rows = slice(offset, offset + slot.window.scene.cloth.num_vertices)
             offset = rows.stop
-            pos, vel = next_pos[rows].detach(), next_vel[rows].detach()
+            pos, vel, cloth = next_pos[rows].detach(), next_vel[rows].detach(), slot.window.scene.cloth
             if slot.age == 0:
                 vel = self._relaxed(slot, vel)
             slot.state = State(pos, vel, slot.state.origin)
             slot.age += 1
-            if not bool(torch.isfinite(pos).all()) or not self.whole and _is_torn(scene.cloth, pos, self.torn_strain):
+            if is_lost(cloth, pos, self.ending_strain) if lost is None else lost[place]:
                 slot.window = None
         self._turns[number] += 1
 
@@ -293,5 +317,11 @@ class Slots:
         return self.simulator.prepare(window.scene.cloth, self.sampler.garments[window.template].rest_pos)
 
 
-def _is_torn(cloth: Cloth, pos: Tensor, strain: float) -> bool:
-    return float((edge_strain(cloth, pos).abs() > strain).double().mean()) > 0.01
+def is_lost(cloth: Cloth, pos: Tensor, torn_strain: float) -> Tensor:
+    """Scenes (B,) bool whose rollout ends with ``pos`` (V, 3) [m]: it is not finite, or more than 1% of the edges are strained
+    more than ``torn_strain``, a share of their length at rest; infinite: however torn."""
+    count, like = cloth.num_scenes, cloth.rest_pos.new_zeros(0, dtype=torch.float64)
+    broken = sum_scenes((~torch.isfinite(pos)).any(dim=1).to(like), cloth.vertex_scene, count)
+    torn = sum_scenes((edge_strain(cloth, pos).abs() > torn_strain).to(like), cloth.edge_scene, count)
+    edges = sum_scenes(like.new_ones(len(cloth.edges)), cloth.edge_scene, count)
+    return (broken > 0) | (torn / edges.clamp_min(1.0) > 0.01)

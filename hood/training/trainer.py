@@ -6,22 +6,19 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import say
-from hood.energies.potential import Potential, relative_gradient
-from hood.energies.problem import StepProblem
+from hood.energies.potential import Potential
 from hood.energies.self_contact import for_networks
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.network.kernel_choice import AUTO, KernelChoice, choose_for
 from hood.steppers.checkpoint import save_simulator
-from hood.steppers.network import NetworkStepper, Prediction
+from hood.steppers.network import NetworkStepper
 from hood.steppers.protocol import Stopwatch, timed
 from hood.steppers.ranges import training_conditions
 from hood.training import distributed
@@ -40,18 +37,16 @@ from hood.training.log import (
     MetricsLog,
     Skipped,
     made_behind,
-    output_spread,
     told,
 )
 from hood.training.scenes import SceneSampler
 from hood.training.settings import Signal, TrainerSettings, make_optimizer, make_whitening
 from hood.training.slots import Slots
+from hood.training.updates import Observer, Update, make_captured, plain_update
 from hood.training.watch import ValidationWatch
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
 _Progress = Callable[[int, dict[str, float] | None], None]
-#: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
-_Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
 
 
 class Trainer:
@@ -111,11 +106,14 @@ class Trainer:
             for module in simulator.modules():
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
+        closed = ranks > 1 or settings.activation_checkpointing
+        ways = (self.signal, settings.collision, self.slots.ending_strain)
+        self._captured = make_captured(settings.step, simulator, *ways, closed)
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration, self.earlier, self.rollbacks = 0, earlier, 0
         self.best = math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
-        self.observe: _Observer | None = None
+        self.observe: Observer | None = None
         self._constant = ConstantOutput(settings.learning_rate)
         self._skips = Skipped()
         self._rollbacks_in_row = 0
@@ -198,51 +196,46 @@ class Trainer:
         """One step of every slot and one optimiser update; returns what was measured."""
         settings, simulator = self.settings, self.simulator
         simulator.train()
-        count, clock = settings.count(self.iteration), self.stopwatch
-        with timed(clock, "scenes"):
-            cloth, prepared, state, step = self.slots.batch(settings.horizon.after_relaxing(count))
+        count = settings.count(self.iteration)
         potential = settings.collision.apply(self.potential, count)
         simulator.use_potential(for_networks(potential))
-        with timed(clock, "search"):
-            asked = StepProblem(cloth, state, step, gravity=simulator.gravity)
-            problem = potential.prepare(simulator.rules.judged(asked))
-        shown = problem if problem.state is state else replace(problem, state=state)
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
-        if collecting and simulator.output.collects_statistics and self.whitening.fresh:  # else they came with the weights
-            simulator.output.observe(self.slots.skinned_accelerations())
+        self.optimizer.zero_grad(set_to_none=True)
         with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
-            prediction = (simulator if collecting else self.model)(shown, prepared, clock)
-        next_pos = prediction.next_pos.detach()
-        acc = prediction.acc.detach() if shown is problem else problem.acceleration(next_pos)
-        with timed(clock, "losses"):
-            gradient, energies = potential.gradient(problem, next_pos, acc)
-            gradient = gradient * cloth.free.unsqueeze(1)
-            residual = relative_gradient(problem, gradient)
-        if self.observe is not None:
-            self.observe(problem, potential, prediction, residual)
-        report = {name: float(value.mean()) for name, value in energies.items()}
-        report |= {
-            "total": sum(report.values()),
-            "loss": float(self.signal.loss(problem, energies, acc, residual).mean()),
-            "relative_gradient": float(residual.median()),
-            "horizon": float(settings.horizon(count)),
-            "output_spread": output_spread(prediction.acc.detach(), cloth.free),
-        }
+            update = self._take(potential, settings.horizon.after_relaxing(count), collecting)
+        if not collecting and update.backward is not None:
+            with timed(self.stopwatch, "backward"):
+                update.backward()
+        means, lost = update.read()
+        energies = {name: means[name] for name in update.energies}
+        report = {**energies, "total": sum(energies.values()), **means, "horizon": float(settings.horizon(count))}
         if not collecting:
-            weight = self.signal.weight(problem, residual)
-            # The analytic gradient is injected at the output: no graph through the energies is kept.
-            surrogate = (prediction.next_pos * (gradient * weight[cloth.vertex_scene].unsqueeze(1))).sum()
-            for pos, force in prediction.early:  # every pass answers for where it leads itself
-                weight = self.signal.weight(problem, relative_gradient(problem, force))
-                surrogate = surrogate - (pos * (force * weight[cloth.vertex_scene].unsqueeze(1))).sum()
-            if self.model is not simulator:
-                # A share without body edges leaves their networks out; all processes must reduce the same parameters.
-                surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
-            report |= self._optimise(surrogate, {name: report[name] for name in energies})
-        with timed(clock, "scenes"):
-            self.slots.advance(prediction.next_pos, simulator.next_velocity(shown, prediction))
+            report |= self._optimise(energies)
+        with timed(self.stopwatch, "scenes"):
+            self.slots.advance(update.next_pos, update.next_vel, lost)
         self.iteration += 1
         return report
+
+    def _take(self, potential: Potential, horizon: int, collecting: bool) -> Update:
+        """The step of all scenes."""
+        simulator, clock = self.simulator, self.stopwatch
+        if self._captured is not None and not collecting and self.observe is None:
+            with timed(clock, "scenes"):
+                parts = self.slots.each(horizon)
+            try:
+                with timed(clock, "network"):
+                    return self._captured(parts, potential)
+            except (ValueError, RuntimeError) as error:
+                if self.settings.step != "auto":
+                    raise
+                self._captured = None
+                say(f"hood: trainer.step=plain: no CUDA graph of an update could be made ({error})", error=True)
+        with timed(clock, "scenes"):
+            part = self.slots.batch(horizon)
+        if collecting and simulator.output.collects_statistics and self.whitening.fresh:  # else they came with the weights
+            simulator.output.observe(self.slots.skinned_accelerations())
+        model = simulator if collecting else self.model
+        return plain_update(simulator, model, part, potential, self.signal, self.slots.ending_strain, clock, self.observe)
 
     def averaged(self) -> NetworkStepper:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""
@@ -410,14 +403,11 @@ class Trainer:
             header = {"iteration": self._iterations_in_all, "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
-    def _optimise(self, surrogate: Tensor, energies: Mapping[str, float]) -> dict[str, float]:
+    def _optimise(self, energies: Mapping[str, float]) -> dict[str, float]:
         settings, finite = self.settings, math.isfinite(sum(energies.values()))
         factor = settings.schedule(self.iteration, settings.iterations)
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * factor
-        self.optimizer.zero_grad(set_to_none=True)
-        with timed(self.stopwatch, "backward"):
-            surrogate.backward()
         with timed(self.stopwatch, "optimiser"):
             self.whitening.pull()
             # The norm before it is shortened, which also tells infinite gradients.

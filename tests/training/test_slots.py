@@ -68,7 +68,7 @@ def record(slots: Slots, num_updates: int) -> list[tuple[Tensor, ...]]:
     """What the network gets to see in the next updates; cloth moves with the body."""
     seen = []
     for _ in range(num_updates):
-        cloth, _, state, step = slots.batch(HORIZON)
+        cloth, _, state, step, _ = slots.batch(HORIZON)
         obstacle = step.obstacle
         assert obstacle is not None
         seen.append((cloth.rest_pos, cloth.density, cloth.faces, state.pos, obstacle.pos, obstacle.next_pos, obstacle.faces))
@@ -201,7 +201,7 @@ def test_a_rollout_ends_where_it_is_torn(
     """All edges are strained by 50%."""
     slots, seen = Slots(sampler, simulator, 1, 0, 5, torn_strain=torn_strain), []
     for _ in range(4):
-        cloth, _, state, _ = slots.batch(5)
+        cloth, _, state, *_ = slots.batch(5)
         slots.advance(1.5 * cloth.rest_pos, torch.zeros_like(state.vel))
         seen.append(slots.state_dict()[0]["age"])
     assert seen == ages

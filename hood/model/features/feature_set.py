@@ -31,6 +31,7 @@ from hood.model.features.groups import (
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.builder import BODY, LAYERS
+from hood.model.graph.static_shapes import Filled, FixedGraph
 
 
 class FeatureSet(nn.Module):
@@ -91,12 +92,13 @@ class FeatureSet(nn.Module):
         """Node features (V + W_active, node_width) and edge features by set, rows as in the graph; the columns by torch if not
         said otherwise."""
         columns = columns or IN_TORCH
-        nodes = _normalized(columns.nodes(self, inputs), self.node_normalizer)
-        rows = _normalized(columns.edges(self, inputs), self.edge_normalizer)
+        there = inputs.graph.filled() if self.training and isinstance(inputs.graph, FixedGraph) else _ALL
+        nodes = _normalized(columns.nodes(self, inputs), self.node_normalizer, there.nodes)
+        rows = _normalized(columns.edges(self, inputs), self.edge_normalizer, there.edges)
         counts = [inputs.graph.edge_sets[name].num_edges for name in inputs.cloth_sets]
         edges = dict(zip(inputs.cloth_sets, rows.split(counts), strict=True))
         found = columns.body_edges(self, inputs) if inputs.body_edges.num_edges else None
-        edges[BODY] = _changing(found, nodes, self.edge_widths[BODY], self.body_edge_normalizer)
+        edges[BODY] = _changing(found, nodes, self.edge_widths[BODY], self.body_edge_normalizer, there.body_edges)
         if len(self.layer_edge):
             found = _together(self.layer_edge, inputs) if inputs.layer_edges.num_edges else None
             edges[LAYERS] = _changing(found, nodes, self.edge_widths[LAYERS], self.layer_edge_normalizer)
@@ -122,14 +124,19 @@ IN_TORCH = Columns(
 )
 
 
-def _normalized(values: Tensor, normalizer: RunningNormalizer | None) -> Tensor:
-    return values if normalizer is None else normalizer.leading(values)
+_ALL = Filled(None, None, None)
 
 
-def _changing(found: Tensor | None, like: Tensor, width: int, normalizer: RunningNormalizer | None) -> Tensor:
+def _normalized(values: Tensor, normalizer: RunningNormalizer | None, filled: Tensor | None = None) -> Tensor:
+    return values if normalizer is None else normalizer.leading(values, filled)
+
+
+def _changing(
+    found: Tensor | None, like: Tensor, width: int, normalizer: RunningNormalizer | None, filled: Tensor | None = None
+) -> Tensor:
     """Columns of edges that a step may have none of, normalised."""
     if found is not None:
-        return _normalized(found, normalizer)
+        return _normalized(found, normalizer, filled)
     none = like.new_zeros(0, width)
     if normalizer is not None:
         # No rows count as nothing, but processes that share a batch all have to be heard.

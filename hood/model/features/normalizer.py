@@ -69,10 +69,15 @@ class RunningNormalizer(nn.Module):
         mean, std = self.statistics(x.dtype)
         return (x - mean) / std
 
-    def leading(self, x: Tensor) -> Tensor:
-        """:meth:`forward` of the first columns of a wider table (N, ≥ width), written into it; the others stay."""
+    def leading(self, x: Tensor, filled: Tensor | None = None) -> Tensor:
+        """:meth:`forward` of the first columns of a wider table (N, ≥ width), written into it; the others stay.
+
+        ``filled`` (N,) bool: rows that count, of a table of fixed shape; nothing is asked of the device then.
+        """
         part = x[:, : self.width]
-        if self.training and not self.frozen:
+        if self.training and filled is not None:
+            self._update_filled(part, filled)
+        elif self.training and not self.frozen:
             self.update(part)
         mean, std = self.statistics(x.dtype)
         part.sub_(mean).div_(std)
@@ -106,6 +111,20 @@ class RunningNormalizer(nn.Module):
         first, second = (moments[1:] / moments[0]).split(self.width)
         self.first.mul_(self.decay).add_(first, alpha=fresh)
         self.second.mul_(self.decay).add_(second, alpha=fresh)
+
+    @torch.no_grad()
+    def _update_filled(self, x: Tensor, filled: Tensor) -> None:
+        rows = torch.where(filled.unsqueeze(1), x.detach(), 0.0).double()
+        count = filled.sum().double()
+        counts = (count > 0) & ~self.frozen
+        self.num_updates.add_(counts.long())
+        sums = (count, rows.sum(dim=0), rows.square().sum(dim=0))
+        for total, part in zip((self.weight, self.first, self.second), sums, strict=True):
+            if self.decay == 0:
+                total.add_(torch.where(counts, part, 0.0))
+                continue
+            fresh = 1.0 - self.decay if self.decay < 1 else 1.0
+            total.copy_(torch.where(counts, total * self.decay + fresh * part / count.clamp_min(1.0), total))
 
     def statistics(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation in use, each (width,)."""

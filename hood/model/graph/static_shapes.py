@@ -10,6 +10,7 @@ can tell and repeat the step with more.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +18,7 @@ from torch.nn import functional
 
 from hood.cloth.state import Attachments, Obstacle
 from hood.mesh.closest_point.vertices import Nearest
-from hood.model.graph.builder import BODY, MESH, EdgeSet, Graph, StaticGraph, Subset, mesh_set, set_level
+from hood.model.graph.builder import BODY, LAYERS, MESH, EdgeSet, Graph, StaticGraph, Subset, mesh_set, set_level
 from hood.tensors.batch import gather_true
 
 #: Capacities are multiples of this.
@@ -81,6 +82,28 @@ class FixedGraph(Graph):
     """
 
     num_found: Tensor
+
+    def filled(self) -> Filled:
+        """Which rows of its tables are of nodes and edges that there are."""
+        num_edges, num_vertices = self.num_found.unbind()
+        device, half = self.node_level.device, self.edge_sets[BODY].num_edges // 2
+        body = torch.arange(len(self.body_vertex), device=device) < num_vertices
+        # The filled places come first, as cloth's edges and, sorted by body node, as the body's.
+        edges = torch.arange(half, device=device) < num_edges
+        num_cloth_edges = sum(edge_set.num_edges for name, edge_set in self.edge_sets.items() if name not in (BODY, LAYERS))
+        return Filled(
+            torch.cat([torch.ones_like(self.node_level, dtype=torch.bool), body]),
+            torch.ones(num_cloth_edges, dtype=torch.bool, device=device),
+            torch.cat([edges, edges]),
+        )
+
+
+class Filled(NamedTuple):
+    """Rows (N,) bool of the tables of nodes, cloth edges and body edges that are not spare; None: all of them."""
+
+    nodes: Tensor | None
+    edges: Tensor | None
+    body_edges: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -173,7 +196,8 @@ def _edges_of(places: _Places, num_cloth: int, num_body: int) -> EdgeSet:
     place, body = torch.arange(size, device=device), torch.arange(num_body + 1, device=device)
     nodes = torch.cat([places.cloth, num_cloth + body[:-1]])
     receivers, senders = torch.cat([place, size + places.key]), torch.cat([size + places.body, places.order])
-    position = torch.empty_like(place).scatter(0, places.order, place)
+    # Of a part the order names spare places once; the others are found at the end, where all are spare.
+    position = torch.full_like(place, size - 1).scatter(0, places.order, place)
     return EdgeSet(
         senders=nodes.index_select(0, senders),
         receivers=nodes.index_select(0, receivers),

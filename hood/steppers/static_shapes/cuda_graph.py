@@ -45,9 +45,14 @@ class InputMemory:
 
 
 class CudaGraph:
-    """``function(*inputs)``, recorded once; what it returns is written anew by the next call."""
+    """``function(*inputs)``, recorded once; what it returns is written anew by the next call.
 
-    def __init__(self, function: Run, inputs: Sequence[Tensor]) -> None:
+    Args:
+        pool: of another graph, whose memory this one may use as well: the two must never run at once, and what the other
+            returned stays as it is.
+    """
+
+    def __init__(self, function: Run, inputs: Sequence[Tensor], pool: Any = None) -> None:
         # Kept for the memory it holds, which the graph reads without knowing of.
         self._function, self._inputs = function, list(inputs)
         stream = torch.cuda.Stream()
@@ -57,8 +62,13 @@ class CudaGraph:
                 function(*self._inputs)
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
+        with torch.cuda.graph(self._graph, pool=pool):
             self._outputs = function(*self._inputs)
+
+    @property
+    def pool(self) -> Any:
+        """The memory that it computes in."""
+        return self._graph.pool()
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         same = all(a is b for a, b in zip(inputs, self._inputs, strict=True))

@@ -16,14 +16,12 @@ import torch
 from torch import Tensor
 
 from hood.cloth.cloth import Cloth
-from hood.cloth.state import Obstacle
 from hood.contact.contact import find_nearest
 from hood.energies.potential import Potential, keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point.search import Incidence
-from hood.mesh.closest_point.vertices import Nearest
 from hood.model.features.inputs import EdgeRows, Inputs
-from hood.model.graph.static_shapes import Capacity, StaticLayout, build_fixed_graph, capacity_for, lay_out
+from hood.model.graph.static_shapes import Capacity, FixedGraph, StaticLayout, build_fixed_graph, capacity_for, lay_out
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import incidence_of
 from hood.steppers.network import NetworkStepper, Prediction, Prepared
@@ -96,30 +94,11 @@ class FixedStep:
 
     def _step(self, problem: StepProblem, incidence: Incidence | None) -> tuple[Tensor, ...]:
         simulator = self.simulator
-        folds = self._potential is not None and keeps_both_sides(self._potential)
-        problem, num_faces = with_fixed_contact(problem, incidence, self.layout.capacity.faces, folds, self.dense)
-        if self._potential is not None:
-            problem = self._potential.with_internal_force(problem, compiled=False)
-        seen = simulator.rules.stand(self._in_frames(problem))
-        obstacle, nearest = seen.step.obstacle, None
-        if obstacle is not None:
-            nearest = self._nearest(problem, seen, obstacle)
-        graph = build_fixed_graph(self.layout, obstacle, nearest, simulator.body_radius)
+        problem, seen, graph, num_found = see(simulator, self.layout, problem, incidence, self._potential, self.dense)
         sight = simulator.look(problem, seen, graph, self._potential, self._rows)
         prediction = simulator.advance(problem, seen, sight, *simulator.features(sight.inputs))
         velocity = simulator.next_velocity(problem, prediction)
-        return prediction.next_pos, prediction.acc, velocity, torch.cat([graph.num_found, num_faces])
-
-    def _nearest(self, problem: StepProblem, seen: StepProblem, obstacle: Obstacle) -> Nearest:
-        if seen.contact is not None and seen.state is problem.state:
-            return seen.contact.nearest
-        return find_nearest(seen.cloth, seen.state.pos, obstacle, self.simulator.body_radius, self.dense)
-
-    def _in_frames(self, problem: StepProblem) -> StepProblem:
-        frame_dt = self.simulator.rules.frame_dt
-        if frame_dt is None:
-            return problem
-        return altered(problem, step=altered(problem.step, dt=torch.full_like(problem.step.dt, frame_dt)))
+        return prediction.next_pos, prediction.acc, velocity, num_found
 
     @torch.no_grad()
     def _edge_rows(self) -> EdgeRows:
@@ -133,6 +112,41 @@ class FixedStep:
         for group in self.simulator.features.edge:
             group(given)
         return given.edges
+
+
+def see(
+    simulator: NetworkStepper,
+    layout: StaticLayout,
+    problem: StepProblem,
+    incidence: Incidence | None,
+    potential: Potential | None,
+    dense: bool,
+) -> tuple[StepProblem, StepProblem, FixedGraph, Tensor]:
+    """The problem with its contact, as the simulator sees it, its graph, and what :attr:`StepResult.num_found` holds.
+
+    Args:
+        potential: settled; None where nobody looks at one.
+        dense: see :class:`FixedStep`.
+    """
+    folds = potential is not None and keeps_both_sides(potential)
+    problem, num_faces = with_fixed_contact(problem, incidence, layout.capacity.faces, folds, dense)
+    if potential is not None:
+        problem = potential.with_internal_force(problem, compiled=False)
+    seen = simulator.rules.stand(_in_frames(simulator, problem))
+    obstacle, nearest = seen.step.obstacle, None
+    if obstacle is not None and seen.contact is not None and seen.state is problem.state:
+        nearest = seen.contact.nearest
+    elif obstacle is not None:
+        nearest = find_nearest(seen.cloth, seen.state.pos, obstacle, simulator.body_radius, dense)
+    graph = build_fixed_graph(layout, obstacle, nearest, simulator.body_radius)
+    return problem, seen, graph, torch.cat([graph.num_found, num_faces])
+
+
+def _in_frames(simulator: NetworkStepper, problem: StepProblem) -> StepProblem:
+    frame_dt = simulator.rules.frame_dt
+    if frame_dt is None:
+        return problem
+    return altered(problem, step=altered(problem.step, dt=torch.full_like(problem.step.dt, frame_dt)))
 
 
 def check_model(simulator: NetworkStepper) -> None:
@@ -228,7 +242,7 @@ class CapturedSimulator:
         result = plan.take(problem)
         counts = _read(result.num_found)
         while not plan.layout.capacity.holds(counts):
-            plan = self._make_plan(problem, prepared, capacity_for(counts, _limits(problem)))
+            plan = self._make_plan(problem, prepared, more_capacity(counts, problem))
             result = plan.take(problem)
             counts = _read(result.num_found)
         # The next step writes to the same memory.
@@ -244,7 +258,7 @@ class CapturedSimulator:
     def _plan(self, problem: StepProblem, prepared: Prepared) -> _Plan:
         plan = self._plans.get(self._key(problem))
         if plan is None or plan.is_stale(problem, prepared):
-            plan = self._make_plan(problem, prepared, self._capacity or self._first_capacity(problem))
+            plan = self._make_plan(problem, prepared, self._capacity or first_capacity(self.simulator, problem))
         return plan
 
     def _make_plan(self, problem: StepProblem, prepared: Prepared, capacity: Capacity) -> _Plan:
@@ -258,14 +272,23 @@ class CapturedSimulator:
     def _key(self, problem: StepProblem) -> tuple[Any, ...]:
         return (id(problem.cloth), *step_shape(problem, self.simulator.needs_contact))
 
-    def _first_capacity(self, problem: StepProblem) -> Capacity:
-        obstacle = problem.step.obstacle
-        if obstacle is None:
-            return Capacity(1, 1)
-        seen = self.simulator.rules.enter(problem)
-        nearest = find_nearest(seen.cloth, seen.state.pos, obstacle, self.simulator.body_radius)
-        near = torch.isfinite(nearest.dist)
-        return capacity_for((int(near.sum()), len(nearest.vertex[near].unique()), 0), _limits(problem))
+
+def first_capacity(simulator: NetworkStepper, problem: StepProblem) -> Capacity:
+    """Places to begin with: what the step needs, and a quarter more."""
+    obstacle = problem.step.obstacle
+    if obstacle is None:
+        return Capacity(1, 1)
+    seen = simulator.rules.enter(problem)
+    nearest = find_nearest(seen.cloth, seen.state.pos, obstacle, simulator.body_radius)
+    near = torch.isfinite(nearest.dist)
+    return more_capacity((int(near.sum()), len(nearest.vertex[near].unique()), 0), problem)
+
+
+def more_capacity(num_found: tuple[int, int, int], problem: StepProblem) -> Capacity:
+    """Places for what a step has found, and a quarter more."""
+    num_cloth, obstacle = problem.cloth.num_vertices, problem.step.obstacle
+    num_body, num_faces = (0, 0) if obstacle is None else (len(obstacle.pos), len(obstacle.faces))
+    return capacity_for(num_found, (num_cloth, min(num_cloth, num_body), num_faces))
 
 
 def network_of(stepper: Stepper) -> NetworkStepper | None:
@@ -315,13 +338,6 @@ class _Plan:
 
     def _read(self, problem: StepProblem) -> list[Tensor]:
         return step_inputs(problem, self._simulator.needs_contact)
-
-
-def _limits(problem: StepProblem) -> tuple[int, int, int]:
-    num_cloth = problem.cloth.num_vertices
-    obstacle = problem.step.obstacle
-    num_body, num_faces = (0, 0) if obstacle is None else (len(obstacle.pos), len(obstacle.faces))
-    return num_cloth, min(num_cloth, num_body), num_faces
 
 
 def _read(counts: Tensor) -> tuple[int, int, int]:

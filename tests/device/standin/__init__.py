@@ -73,6 +73,9 @@ class _Graph:
     def begin(self) -> None:
         self._number = device.begin_graph()
 
+    def pool(self) -> None:
+        """All memory is one."""
+
     def replay(self) -> None:
         device.replay(self._number)
 

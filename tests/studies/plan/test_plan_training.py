@@ -59,7 +59,7 @@ def test_terms_that_teach_are_told_from_those_that_do_not(planned: dict[str, Any
 
 def test_draws_are_those_of_the_training(planned: dict[str, Any]) -> None:
     trainer = make_trainer(load_config("train", [*WORDS, "trainer.workers=0"]))
-    cloth, _, _, _ = trainer.slots.batch(4)
+    cloth = trainer.slots.batch(4).cloth
     drawn = planned["drawn"]
     assert drawn["garments"] == {"tank": 1, "skirt": 1}
     assert drawn["garments_never"] == []

@@ -1,0 +1,416 @@
+"""What the weights of a network are told by one update: gradients and measures, operation by operation or as one recorded
+function of fixed shapes."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from hood.cloth.cloth import Cloth
+from hood.energies.contact import Collision
+from hood.energies.friction import Friction
+from hood.energies.potential import Potential, relative_gradient
+from hood.energies.problem import StepProblem
+from hood.energies.self_contact import for_networks
+from hood.energies.term import Term, WeightedTerm, named
+from hood.model.features.inputs import Inputs
+from hood.model.features.normalizer import RunningNormalizer
+from hood.model.graph.static_shapes import Capacity, StaticLayout, lay_out
+from hood.native import features as native
+from hood.solver.vertex.block_jacobi import incidence_of
+from hood.steppers.network import NetworkStepper, Prediction, Prepared
+from hood.steppers.protocol import Stopwatch, timed
+from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
+from hood.steppers.static_shapes.problem import altered, problem_from, settled_potential, step_inputs, step_shape
+from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
+from hood.tensors.precision import products
+from hood.training.curriculum import CollisionRamp
+from hood.training.log import output_spread
+from hood.training.settings import Signal
+from hood.training.slots import Part, is_lost
+
+#: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
+Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
+
+
+@dataclass(frozen=True)
+class Update:
+    """Where an update leads its scenes, and what was measured; the gradients are with the parameters."""
+
+    next_pos: Tensor  # (V, 3) m
+    next_vel: Tensor  # (V, 3) m/s
+    measured: Tensor  # (M,) means of the energies in the order of ``energies``, then what :data:`MEASURED` says
+    energies: tuple[str, ...]
+    lost: Tensor  # (B,) bool: rollouts that end here
+    backward: Callable[[], None] | None = None  # computes the gradients, where that is not done
+
+    def read(self) -> tuple[dict[str, float], list[bool]]:
+        """``measured`` by name, and ``lost``; waits for the device, once."""
+        values = torch.cat([self.measured, self.lost.to(self.measured)]).tolist()
+        names = (*self.energies, *MEASURED)
+        return dict(zip(names, values, strict=False)), [value > 0 for value in values[len(names) :]]
+
+
+#: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
+#: output; of scenes that are updated one after the other the means of these.
+MEASURED = ("loss", "relative_gradient", "output_spread")
+
+
+def measure(
+    problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, output: Tensor, residual: Tensor, signal: Signal
+) -> Tensor:
+    """:attr:`Update.measured`; ``output`` (V, 3) are the accelerations that the network gives, ``acc`` those of the step."""
+    means = [value.mean() for value in energies.values()]
+    loss = signal.loss(problem, energies, acc, residual).mean()
+    return torch.stack([*means, loss, residual.median(), output_spread(output, problem.cloth.free).to(loss)])
+
+
+def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
+    """A number whose gradient is that of the training signal: the energies' own is put in at the output, so that no graph
+    through them is kept."""
+    scene = problem.cloth.vertex_scene
+    weight = signal.weight(problem, residual)
+    surrogate = (prediction.next_pos * (gradient * weight[scene].unsqueeze(1))).sum()
+    for pos, force in prediction.early:  # every pass answers for where it leads itself
+        weight = signal.weight(problem, relative_gradient(problem, force))
+        surrogate = surrogate - (pos * (force * weight[scene].unsqueeze(1))).sum()
+    return surrogate
+
+
+def plain_update(
+    simulator: NetworkStepper,
+    model: nn.Module,
+    part: Part,
+    potential: Potential,
+    signal: Signal,
+    torn_strain: float,
+    clock: Stopwatch | None = None,
+    observe: Observer | None = None,
+) -> Update:
+    """One step of all scenes of ``part``, operation by operation.
+
+    Args:
+        model: the simulator, or what processes that share a batch have around it.
+        torn_strain: see :func:`hood.training.slots.is_lost`.
+    """
+    cloth, state = part.cloth, part.state
+    with timed(clock, "search"):
+        asked = StepProblem(cloth, state, part.step, gravity=simulator.gravity)
+        problem = potential.prepare(simulator.rules.judged(asked))
+    shown = problem if problem.state is state else replace(problem, state=state)
+    prediction = model(shown, part.prepared, clock)
+    next_pos = prediction.next_pos.detach()
+    acc = prediction.acc.detach() if shown is problem else problem.acceleration(next_pos)
+    with timed(clock, "losses"):
+        gradient, energies = potential.gradient(problem, next_pos, acc)
+        gradient = gradient * cloth.free.unsqueeze(1)
+        residual = relative_gradient(problem, gradient)
+    if observe is not None:
+        observe(problem, potential, prediction, residual)
+
+    def backward() -> None:
+        surrogate = surrogate_of(problem, prediction, gradient, residual, signal)
+        if model is not simulator:
+            # A share without body edges leaves their networks out; all processes must reduce the same parameters.
+            surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
+        surrogate.backward()
+
+    return Update(
+        next_pos,
+        simulator.next_velocity(shown, prediction).detach(),
+        measure(problem, energies, acc, prediction.acc.detach(), residual, signal),
+        tuple(energies),
+        is_lost(cloth, next_pos, torn_strain),
+        backward,
+    )
+
+
+class CapturedUpdates:
+    """Takes the updates of plain scenes with fixed shapes: search, features, network, energies and the way back to the weights
+    are one function of tensors, which waits for nothing on the host.
+
+    One is made for every garment, and again for its mirror image: what is drawn anew (size, fabric, body) is among its inputs.
+    The scenes of a batch take it one after the other. What comes out is what :func:`plain_update` gives, up to rounding.
+
+    Args:
+        mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph of them, replayed at once.
+        torn_strain: see :func:`hood.training.slots.is_lost`.
+
+    Raises:
+        ValueError: another mode, ``captured`` without CUDA, or a model that has no such form.
+    """
+
+    def __init__(self, simulator: NetworkStepper, signal: Signal, ramp: CollisionRamp, torn_strain: float, mode: str) -> None:
+        if mode not in ("fixed", "captured"):
+            raise ValueError(f"trainer.step is {mode!r}; choose auto, plain, fixed or captured")
+        if mode == "captured" and not has_graphs(simulator.gravity.device):
+            raise ValueError("trainer.step=captured needs device=cuda, a CPU has no graphs to replay; use fixed or plain")
+        reason = refusal(simulator, ramp)
+        if reason is not None:
+            raise ValueError(f"trainer.step={mode}: {reason}; use trainer.step=plain")
+        self.simulator, self.signal, self.torn_strain, self.mode = simulator, signal, torn_strain, mode
+        self._plans: dict[Any, _Plan] = {}
+
+    def __call__(self, parts: Sequence[Part], potential: Potential) -> Update:
+        """One update of the scenes, one after the other; the gradients of their mean are with the parameters.
+
+        Raises:
+            ValueError: a scene or the potential has no form of fixed shapes; the message says what to use.
+        """
+        outcomes = [self._take(part, potential, len(parts) == 1) for part in parts]
+        for parameter, *given in zip(self.simulator.parameters(), *(outcome.gradients for outcome in outcomes), strict=True):
+            parameter.grad = given[0] if len(given) == 1 else torch.stack(given).mean(dim=0)
+        return Update(
+            torch.cat([outcome.next_pos for outcome in outcomes]),
+            torch.cat([outcome.next_vel for outcome in outcomes]),
+            torch.stack([outcome.measured for outcome in outcomes]).mean(dim=0),
+            outcomes[0].energies,
+            torch.cat([outcome.lost for outcome in outcomes]),
+        )
+
+    def _take(self, part: Part, potential: Potential, alone: bool) -> _Outcome:
+        problem = StepProblem(part.cloth, part.state, part.step, gravity=self.simulator.gravity)
+        if problem.num_scenes > 1 or problem.step.attachments is not None:
+            raise ValueError("scenes with fasteners have no update of fixed shapes: use trainer.step=plain")
+        key = (part.kind, _shape(problem))
+        plan = self._plans.get(key)
+        capacity = first_capacity(self.simulator, problem) if plan is None else plan.layout.capacity
+        while True:
+            if plan is None or plan.layout.capacity != capacity:
+                self._plans.pop(key, None)  # its memory is free before there is another
+                plan = self._plans[key] = _Plan(self, problem, part.prepared, potential, capacity)
+            outcome = plan.take(problem, potential, alone)
+            if capacity.holds(outcome.num_found):
+                plan.keep_statistics()
+                return outcome
+            capacity = more_capacity(outcome.num_found, problem)
+
+    @property
+    def pool(self) -> Any:
+        """Memory that the graphs have in common: no two of them run at once."""
+        return next((plan.pool for plan in self._plans.values() if plan.pool is not None), None)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    next_pos: Tensor
+    next_vel: Tensor
+    measured: Tensor  # on the host, as ``lost``
+    energies: tuple[str, ...]
+    lost: Tensor
+    num_found: tuple[int, int, int]
+    gradients: tuple[Tensor, ...]
+
+
+class _Plan:
+    """The update made ready for scenes of one shape."""
+
+    def __init__(
+        self, owner: CapturedUpdates, problem: StepProblem, prepared: Prepared, potential: Potential, capacity: Capacity
+    ) -> None:
+        assert prepared.static is not None
+        simulator = owner.simulator
+        self.layout: StaticLayout = lay_out(prepared.static, capacity, None)
+        self._simulator = simulator
+        self._inputs = InputMemory(self._read(problem, potential))
+        self._statistics = list(_statistics(simulator).values())
+        function = _Function(owner, self.layout, problem, settled_potential(potential, problem))
+        self._energies, self._num_parameters = function.energies, len(function.parameters)
+        memory = [*self._inputs.tensors, *simulator.parameters(), *self._statistics]
+        self._memory, self.pool = memory, owner.pool
+        run: Run = function
+        if owner.mode == "captured":
+            with products(simulator.network.precision):
+                run = CudaGraph(trace(run, memory, fold=False), memory, self.pool)
+            self.pool = run.pool
+        self._run = run
+
+    def take(self, problem: StepProblem, potential: Potential, alone: bool) -> _Outcome:
+        """The update; ``alone``: its gradients are used before the next one is computed."""
+        self._inputs.load(self._read(problem, potential))
+        with products(self._simulator.network.precision):
+            next_pos, next_vel, measured, *rest = self._run(*self._memory)
+        gradients, self._counted = rest[: self._num_parameters], rest[self._num_parameters :]
+        edges, vertices, faces, lost, *means = measured.tolist()
+        return _Outcome(
+            next_pos.clone(),  # the next update writes to the same memory
+            next_vel.clone(),
+            measured.new_tensor(means, device="cpu"),
+            self._energies,
+            torch.tensor([lost > 0]),
+            (int(edges), int(vertices), int(faces)),
+            tuple(gradients) if alone else tuple(gradient.clone() for gradient in gradients),
+        )
+
+    def keep_statistics(self) -> None:
+        """What was counted in the last update counts from now on."""
+        for known, counted in zip(self._statistics, self._counted, strict=True):
+            known.copy_(counted)
+
+    def _read(self, problem: StepProblem, potential: Potential) -> list[Tensor]:
+        weight = problem.state.pos.new_full((), _contact_weight(potential))
+        return [weight, *_values(problem.cloth).values(), *step_inputs(problem, surface=True)]
+
+
+class _Function:
+    """``next_pos, next_vel, numbers, *gradients, *statistics = function(*inputs)``.
+
+    ``numbers`` are body edges, active body vertices and faces found, whether the rollout is lost, and what is measured.
+    """
+
+    def __init__(self, owner: CapturedUpdates, layout: StaticLayout, like: StepProblem, potential: Potential) -> None:
+        simulator = owner.simulator
+        self.energies, self._owner, self._layout, self._like = tuple(potential.terms), owner, layout, like
+        self._potential, self._looks = potential, simulator.looks_at_potential
+        self.parameters, self._statistics = dict(simulator.named_parameters()), _statistics(simulator)
+        self._values = list(_values(like.cloth))
+        self._module = _Signal(self)
+        # Tables that are kept with the cloth's faces are made now: a trace has no values for them.
+        self._incidence = incidence_of(like.cloth)
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        given, count = list(inputs), len(self.parameters)
+        statistics = [value.clone() for value in given[len(given) - len(self._statistics) :]]
+        del given[len(given) - len(self._statistics) :]
+        parameters = [value.detach().requires_grad_() for value in given[len(given) - count :]]
+        del given[len(given) - count :]
+        state = {f"simulator.{name}": value for name, value in zip(self.parameters, parameters, strict=True)}
+        state |= {f"simulator.{name}": value for name, value in zip(self._statistics, statistics, strict=True)}
+        with native.in_torch(), torch.enable_grad():
+            surrogate, found = functional_call(self._module, state, tuple(given))
+            gradients = torch.autograd.grad(surrogate, parameters, allow_unused=True, materialize_grads=True)
+        return (*found, *gradients, *statistics)
+
+    def look(self, simulator: NetworkStepper, weight: Tensor, *values: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The number whose gradient trains, and what is not a gradient."""
+        names, owner = self._values, self._owner
+        cloth = _with_values(self._like.cloth, dict(zip(names, values[: len(names)], strict=True)))
+        problem, incidence = problem_from(altered(self._like, cloth=cloth), values[len(names) :])
+        potential = self._potential if self._looks else _weighing(self._potential, weight)
+        shown = for_networks(potential) if self._looks else None
+        dense = owner.mode != "fixed"
+        problem, seen, graph, num_found = see(simulator, self._layout, problem, incidence, potential, dense)
+        rows = Inputs(cloth, problem.state, problem.step, None, graph).make_edge_rows()
+        sight = simulator.look(problem, seen, graph, shown, rows)
+        prediction = simulator.advance(problem, seen, sight, *simulator.features(sight.inputs))
+        next_pos, acc = prediction.next_pos.detach(), prediction.acc.detach()
+        gradient, energies = potential.gradient(problem, next_pos, acc)
+        gradient = gradient * cloth.free.unsqueeze(1)
+        residual = relative_gradient(problem, gradient)
+        surrogate = surrogate_of(problem, prediction, gradient, residual, owner.signal)
+        measured = measure(problem, energies, acc, acc, residual, owner.signal)
+        lost = is_lost(cloth, next_pos, owner.torn_strain)
+        numbers = torch.cat([num_found.to(measured), lost.to(measured), measured])
+        return surrogate, (next_pos, simulator.next_velocity(problem, prediction).detach(), numbers)
+
+
+class _Signal(nn.Module):
+    """:meth:`_Function.look` of a simulator whose parameters and statistics are other tensors for the moment."""
+
+    def __init__(self, function: _Function) -> None:
+        super().__init__()
+        self.simulator, self._function = function._owner.simulator, function
+
+    def forward(self, *values: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        return self._function.look(self.simulator, *values)
+
+
+def make_captured(
+    mode: str, simulator: NetworkStepper, signal: Signal, ramp: CollisionRamp, torn_strain: float, closed: bool
+) -> CapturedUpdates | None:
+    """Who takes the updates that have a form of fixed shapes; None: nobody does.
+
+    Args:
+        mode: ``trainer.step``; ``auto``: captured where there are graphs and the model has such updates.
+        closed: gradients are shared with other processes, or latents computed again on the way back.
+
+    Raises:
+        ValueError: what ``mode`` asks for cannot be had.
+    """
+    if mode == "plain" or (mode == "auto" and (closed or not has_graphs(simulator.gravity.device))):
+        return None
+    if mode == "auto":
+        return None if refusal(simulator, ramp) else CapturedUpdates(simulator, signal, ramp, torn_strain, "captured")
+    if closed:
+        raise ValueError(
+            f"trainer.step={mode}: several processes and trainer.activation_checkpointing have updates operation by operation "
+            "alone; use trainer.step=plain"
+        )
+    return CapturedUpdates(simulator, signal, ramp, torn_strain, mode)
+
+
+def refusal(simulator: NetworkStepper, ramp: CollisionRamp) -> str | None:
+    """Why a training has no updates of fixed shapes; None where it has."""
+    if simulator.layer_radius is not None:
+        return "the model has edges between layers of cloth, as many as a step finds"
+    if simulator.rules.frame_dt is not None:
+        return "the model counts in frames"
+    if simulator.network.kernels != "torch":
+        return "trainer.kernels=compiled computes outside of torch"
+    if simulator.looks_at_potential and ramp.start != ramp.end:
+        return "the model looks at a potential whose weight of contact rises"
+    return None
+
+
+def _statistics(simulator: NetworkStepper) -> dict[str, Tensor]:
+    """What normalisers count, by its name."""
+    return {
+        f"{name}.{key}": value
+        for name, module in simulator.named_modules()
+        if isinstance(module, RunningNormalizer)
+        for key, value in module.named_buffers()
+    }
+
+
+def _values(cloth: Cloth) -> dict[str, Tensor]:
+    """What differs between cloths of one garment: all but the topology."""
+    given = {field.name: getattr(cloth, field.name) for field in fields(cloth)}
+    return {
+        name: value
+        for name, value in given.items()
+        if isinstance(value, Tensor) and (value.is_floating_point() or name == "pinned")
+    }
+
+
+def _with_values(like: Cloth, values: Mapping[str, Tensor]) -> Cloth:
+    """The cloth with other values, and without what was derived from its own."""
+    made = object.__new__(Cloth)
+    for field in fields(like):
+        object.__setattr__(made, field.name, values.get(field.name, getattr(like, field.name)))
+    return made
+
+
+def _shape(problem: StepProblem) -> tuple[Any, ...]:
+    values = _values(problem.cloth)
+    return (*step_shape(problem, surface=True), tuple(values), tuple(value.shape for value in values.values()))
+
+
+def _ramped(potential: Potential) -> dict[str, Term]:
+    """The terms that have the weight of contact."""
+    return {name: potential.terms[name] for name in ("collision", "friction") if name in potential.terms}
+
+
+def _contact_weight(potential: Potential) -> float:
+    return float(next((getattr(term, "weight", 0.0) for term in _ramped(potential).values()), 0.0))
+
+
+def _weighing(potential: Potential, weight: Tensor) -> Potential:
+    """The potential with a weight of contact that is read on the device."""
+    changed: dict[str, Term] = {}
+    for name, term in _ramped(potential).items():
+        if isinstance(term, WeightedTerm) and term.with_weight(0.0) is term:
+            continue
+        if getattr(type(term), "with_weight", None) not in _PLAINLY_WEIGHTED:
+            raise ValueError(f"{named(name, term)} has no weight that a recorded update could change: use trainer.step=plain")
+        changed[name] = copy.copy(term)
+        changed[name].weight = weight  # type: ignore[attr-defined]
+    return potential.only({**potential.terms, **changed})
+
+
+_PLAINLY_WEIGHTED = (Collision.with_weight, Friction.with_weight)

@@ -1,0 +1,184 @@
+"""Updates of fixed shapes: gradients, measures and statistics of the plain ones, whatever is drawn anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from hood.assets.body.body import Body
+from hood.assets.garment.garment import Garment
+from hood.assets.motion.sequence import PoseSequence
+from hood.energies.potential import coded_potential, default_potential
+from hood.energies.self_contact import for_networks
+from hood.model.features.normalizer import RunningNormalizer
+from hood.model.graph.static_shapes import Capacity
+from hood.steppers.network import NetworkStepper, build_simulator
+from hood.training import updates
+from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
+from hood.training.scenes import SceneSampler
+from hood.training.settings import Signal, TrainerSettings
+from hood.training.slots import Part, Slots
+from hood.training.trainer import Trainer
+from hood.training.updates import CapturedUpdates, make_captured, plain_update
+
+PAPER = {"features": "paper", "output": "acceleration"}
+PASSES = {"features": "local", "output": "local_steps", "schedule": "1x(mesh+coarse0) | 1x(mesh)"}
+EDGES = {"features": "physical", "output": "edges"}
+LEVELS = "1x(mesh+coarse0) 1x(coarse0+coarse1) 1x(mesh+coarse0)"
+#: float32 sums in another order; a gradient is compared with the longest of its tensor.
+APART = 2e-4
+#: A weight of contact that changes from update to update.
+RAMP = CollisionRamp(1e5, 5e5, 0, 4)
+STEADY = CollisionRamp()
+
+
+def tiny(options: dict[str, Any]) -> NetworkStepper:
+    torch.manual_seed(0)
+    return build_simulator(**{"schedule": LEVELS, "latent_dim": 8, **options}).train()
+
+
+@pytest.fixture(scope="module")
+def scenes(body: Body, garments: dict[str, Garment], walk: PoseSequence) -> SceneSampler:
+    """Two garments, mirrored or not, of all sizes and fabrics."""
+    return SceneSampler(body, [garments["tank"], garments["skirt"]], [walk.window(0, 90)])
+
+
+def both(simulator: NetworkStepper, parts: list[Part], whole: Part, captured: CapturedUpdates, weight: float) -> None:
+    """An update both ways, from the same weights and statistics: they must agree."""
+    potential = CollisionRamp(weight, weight).apply(default_potential(), 0)
+    simulator.use_potential(for_networks(potential))
+    before = {name: value.clone() for name, value in simulator.named_buffers()}
+    simulator.zero_grad(set_to_none=True)
+    plain = plain_update(simulator, simulator, whole, potential, captured.signal, captured.torn_strain)
+    assert plain.backward is not None
+    plain.backward()
+    gradients = {name: p.grad for name, p in simulator.named_parameters()}
+    counted = {name: value.clone() for name, value in simulator.named_buffers()}
+    for name, value in simulator.named_buffers():
+        value.copy_(before[name])
+    simulator.zero_grad(set_to_none=True)
+    fixed = captured(parts, potential)
+    assert fixed.backward is None
+    torch.testing.assert_close(fixed.next_pos, plain.next_pos, rtol=0, atol=2e-6)
+    torch.testing.assert_close(fixed.next_vel, plain.next_vel, rtol=1e-4, atol=1e-4)
+    (measured, lost), (expected, ends) = fixed.read(), plain.read()
+    assert measured.keys() == expected.keys()
+    for name, value in measured.items():
+        if len(parts) == 1 or name not in ("relative_gradient", "output_spread"):  # a mean of scenes, not of all together
+            assert value == pytest.approx(expected[name], rel=1e-3, abs=1e-6), name
+    assert lost == ends
+    for name, parameter in simulator.named_parameters():
+        expected_gradient = gradients[name]
+        if expected_gradient is None:
+            assert not parameter.grad.any()
+        else:
+            most = float(expected_gradient.abs().max())
+            torch.testing.assert_close(parameter.grad, expected_gradient, rtol=0, atol=APART * most + 1e-9, msg=name)
+    if len(parts) == 1:
+        for name, value in simulator.named_buffers():
+            torch.testing.assert_close(value, counted[name], rtol=1e-6, atol=1e-9, msg=name)
+
+
+@pytest.mark.parametrize("signal", ["potential", "scaled"])
+@pytest.mark.parametrize("options", [PAPER, PASSES, EDGES], ids=["paper", "passes", "edges"])
+def test_a_scene_alone(options: dict[str, Any], signal: str, scenes: SceneSampler) -> None:
+    simulator = tiny(options)
+    captured = CapturedUpdates(simulator, Signal(signal), STEADY, 1.5, "fixed")
+    slots = Slots(scenes, simulator, 1, 0, 2, workers=0)
+    for _ in range(7):  # more than two scenes of a garment: one plan has to fit several
+        parts = slots.each(1)
+        both(simulator, parts, parts[0], captured, 5e5)
+        slots.advance(parts[0].state.pos + 1e-3, parts[0].state.vel)
+    assert len(captured._plans) <= 4
+
+
+def test_a_rising_weight_of_contact_is_read_anew(scenes: SceneSampler) -> None:
+    simulator = tiny(PAPER)
+    captured = CapturedUpdates(simulator, Signal("potential"), RAMP, 1.5, "fixed")
+    part = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
+    for weight in (1e5, 1e6):
+        both(simulator, part, part[0], captured, weight)
+    assert len(captured._plans) == 1
+
+
+def test_a_batch_is_the_mean_of_its_scenes(scenes: SceneSampler) -> None:
+    simulator = tiny(PASSES)
+    captured = CapturedUpdates(simulator, Signal("scaled"), STEADY, 1.5, "fixed")
+    slots = Slots(scenes, simulator, 3, 0, 2, workers=0)
+    both(simulator, slots.each(1), slots.batch(1), captured, 5e5)
+
+
+def test_more_edges_than_places_make_the_update_anew(scenes: SceneSampler, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = tiny(PAPER)
+    monkeypatch.setattr(updates, "first_capacity", lambda *_: Capacity(2, 2))
+    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1.5, "fixed")
+    parts = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
+    both(simulator, parts, parts[0], captured, 5e5)
+    (plan,) = captured._plans.values()
+    assert plan.layout.capacity.edges > 2
+
+
+def test_a_torn_cloth_is_lost(scenes: SceneSampler) -> None:
+    simulator = tiny(PAPER)
+    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1e-6, "fixed")
+    parts = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
+    assert captured(parts, default_potential()).read()[1] == [True]
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.9, 1.0])
+def test_rows_that_are_not_filled_do_not_count(decay: float) -> None:
+    plain, filled = RunningNormalizer(3, decay), RunningNormalizer(3, decay)
+    for count in (4, 0, 7):
+        rows, there = torch.randn(9, 3), torch.arange(9) < count
+        plain.leading(rows[:count].clone())
+        given = filled.leading(rows.clone(), there)
+        assert given.isfinite().all()
+        for name, value in filled.named_buffers():
+            torch.testing.assert_close(value, getattr(plain, name))
+    filled.freeze()
+    before = filled.first.clone()
+    filled.leading(torch.randn(9, 3), torch.ones(9, dtype=torch.bool))
+    assert torch.equal(filled.first, before)
+
+
+@pytest.mark.parametrize(
+    "options, ramp, closed, mode, words",
+    [
+        (PAPER, STEADY, False, "captured", "needs device=cuda"),
+        (PAPER, STEADY, True, "fixed", "several processes"),
+        (PAPER | {"layer_radius": 0.03}, STEADY, False, "fixed", "edges between layers"),
+        (PAPER | {"frame_dt": 1 / 30}, STEADY, False, "fixed", "counts in frames"),
+        (PASSES, RAMP, False, "fixed", "rises"),
+    ],
+)
+def test_what_has_no_such_form_is_refused(
+    options: dict[str, Any], ramp: CollisionRamp, closed: bool, mode: str, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        make_captured(mode, tiny(options), Signal("potential"), ramp, 1.5, closed)
+    assert make_captured("auto", tiny(options), Signal("potential"), ramp, 1.5, closed) is None  # a CPU has no graphs
+
+
+def test_energies_that_search_for_more_are_refused(scenes: SceneSampler) -> None:
+    simulator = tiny(PAPER)
+    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1.5, "fixed")
+    with pytest.raises(ValueError, match="step=plain"):
+        captured(Slots(scenes, simulator, 1, 0, 2, workers=0).each(1), coded_potential())
+
+
+def test_a_training_learns_the_same(scenes: SceneSampler, tmp_path: Path) -> None:
+    settings = TrainerSettings(
+        iterations=8, batch_size=1, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=3, maximum=2),
+        collision=CollisionRamp(1e5, 5e5, 2, 6), statistics_iterations=2, log_every=1, ema_decay=0.0,
+    )  # fmt: skip
+    weights = {}
+    for step in ("plain", "fixed"):
+        trainer = Trainer(tiny(PAPER), default_potential(), scenes, replace(settings, step=step), tmp_path / step, 0)
+        assert trainer.run()
+        weights[step] = trainer.averaged().state_dict()
+    for name, value in weights["plain"].items():
+        torch.testing.assert_close(weights["fixed"][name], value, rtol=1e-3, atol=1e-4, msg=name)
