@@ -30,7 +30,7 @@ from hood.solver.system.iterate import in_double
 from hood.solver.system.plan import plan_for
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.static_shapes.cuda_graph import count_operations, trace
-from hood.steppers.static_shapes.newton_frame import NewtonFrame
+from hood.steppers.static_shapes.newton_pieces import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
 from hood.tensors.dense import whole_arrays

@@ -209,11 +209,11 @@ class Scene:
         if obstacle is not None and self.friction_scale is not None:
             obstacle = replace(obstacle, friction_scale=self.friction_scale.to(obstacle.pos))
         return StepInput(
-            dt=torch.tensor([dt], dtype=state.pos.dtype, device=state.pos.device),
+            dt=state.pos.new_full((1,), dt),
             obstacle=obstacle,
             pin_target=pins,
             attachments=attachments,
-            time=state.pos.new_tensor([time]),
+            time=state.pos.new_full((1,), time),
         )
 
 

@@ -163,7 +163,7 @@ def make_whitening(simulator: NetworkStepper, on: bool) -> Whitening:
 
 
 #: How an update is computed: operation by operation, with fixed shapes, or as a CUDA graph of them; by itself the last.
-STEPS = ("auto", "plain", "fixed", "captured")
+_STEPS = ("auto", "plain", "fixed", "captured")
 
 
 @dataclass(frozen=True)
@@ -227,8 +227,8 @@ class TrainerSettings:
             raise ValueError(f"trainer.precision {self.precision!r}: give {' or '.join(map(repr, PRECISIONS))}")
         if self.kernels not in (AUTO, *KERNELS):
             raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
-        if self.step not in STEPS:
-            raise ValueError(f"trainer.step {self.step!r}: give {' or '.join(map(repr, STEPS))}")
+        if self.step not in _STEPS:
+            raise ValueError(f"trainer.step {self.step!r}: give {' or '.join(map(repr, _STEPS))}")
         if self.optimizer not in OPTIMIZERS:
             raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
         if self.signal not in SIGNALS:

@@ -86,7 +86,7 @@ RELAXED_VELOCITIES = ("skinned", "own", "zero")
 TORN_STRAIN = 1.5
 
 
-class Part(NamedTuple):
+class TrainingStep(NamedTuple):
     """Scenes of an update and the step that they take."""
 
     cloth: Cloth
@@ -166,7 +166,7 @@ class Slots:
         """Rollouts of all buckets, over all processes."""
         return self.buckets[-1].first + self.buckets[-1].count
 
-    def batch(self, horizon: int) -> Part:
+    def batch(self, horizon: int) -> TrainingStep:
         """The current problems as one flat batch; slots past ``horizon`` steps after the relaxing one start a scene first."""
         parts, number = self.each(horizon), self._current()[0]
         counts = [part.cloth.num_vertices for part in parts]
@@ -174,9 +174,9 @@ class Slots:
             cloth = concatenate_cloths([part.cloth for part in parts])
             self._batches[number] = (cloth, self.simulator.concatenate(cloth, [part.prepared for part in parts], counts))
         states, steps = [part.state for part in parts], [part.step for part in parts]
-        return Part(*self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts))
+        return TrainingStep(*self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts))
 
-    def each(self, horizon: int) -> list[Part]:
+    def each(self, horizon: int) -> list[TrainingStep]:
         """The current problems as in :meth:`batch`, every scene alone."""
         slots = self._current()[1]
         for index, slot in slots.items():
@@ -185,7 +185,7 @@ class Slots:
                 self._reset(index, slot, horizon)
         return [self._part(slot) for slot in slots.values()]
 
-    def _part(self, slot: _Slot) -> Part:
+    def _part(self, slot: _Slot) -> TrainingStep:
         window, prepared = slot.window, slot.prepared
         assert window is not None
         assert prepared is not None
@@ -195,7 +195,7 @@ class Slots:
         step = scene.step_input(window.start_frame + max(slot.age - 1, 0), slot.state, relaxing=first)
         if first and slot.still:
             step = replace(step, dt=torch.full_like(step.dt, scene.dt))
-        return Part(scene.cloth, prepared, slot.state, step, (window.template, window.mirrored))
+        return TrainingStep(scene.cloth, prepared, slot.state, step, (window.template, window.mirrored))
 
     def skinned_accelerations(self) -> Tensor:
         """(V, 3) m per frame² of the batch's skinned garments at their current frames: the scale of the paper's output."""

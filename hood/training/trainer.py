@@ -106,12 +106,9 @@ class Trainer:
             for module in simulator.modules():
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
-        closed = ranks > 1 or settings.activation_checkpointing
-        ways = (self.signal, settings.collision, self.slots.ending_strain)
-        self._captured = make_captured(settings.step, simulator, *ways, closed)
+        self._captured = make_captured(simulator, settings, self.slots.ending_strain, ranks)
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
-        self.iteration, self.earlier, self.rollbacks = 0, earlier, 0
-        self.best = math.inf
+        self.iteration, self.earlier, self.rollbacks, self.best = 0, earlier, 0, math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: Observer | None = None
         self._constant = ConstantOutput(settings.learning_rate)

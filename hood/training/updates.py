@@ -32,8 +32,8 @@ from hood.steppers.static_shapes.simulator import first_capacity, more_capacity,
 from hood.tensors.precision import products
 from hood.training.curriculum import CollisionRamp
 from hood.training.log import output_spread
-from hood.training.settings import Signal
-from hood.training.slots import Part, is_lost
+from hood.training.settings import Signal, TrainerSettings
+from hood.training.slots import TrainingStep, is_lost
 
 #: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
 Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
@@ -62,7 +62,7 @@ class Update:
 MEASURED = ("loss", "relative_gradient", "output_spread")
 
 
-def measure(
+def figures_of(
     problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, output: Tensor, residual: Tensor, signal: Signal
 ) -> Tensor:
     """:attr:`Update.measured`; ``output`` (V, 3) are the accelerations that the network gives, ``acc`` those of the step."""
@@ -86,7 +86,7 @@ def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor,
 def plain_update(
     simulator: NetworkStepper,
     model: nn.Module,
-    part: Part,
+    part: TrainingStep,
     potential: Potential,
     signal: Signal,
     torn_strain: float,
@@ -124,7 +124,7 @@ def plain_update(
     return Update(
         next_pos,
         simulator.next_velocity(shown, prediction).detach(),
-        measure(problem, energies, acc, prediction.acc.detach(), residual, signal),
+        figures_of(problem, energies, acc, prediction.acc.detach(), residual, signal),
         tuple(energies),
         is_lost(cloth, next_pos, torn_strain),
         backward,
@@ -139,25 +139,21 @@ class CapturedUpdates:
     The scenes of a batch take it one after the other. What comes out is what :func:`plain_update` gives, up to rounding.
 
     Args:
+        simulator: one that :func:`refusal` has nothing against.
         mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph of them, replayed at once.
         torn_strain: see :func:`hood.training.slots.is_lost`.
 
     Raises:
-        ValueError: another mode, ``captured`` without CUDA, or a model that has no such form.
+        ValueError: ``captured`` without CUDA.
     """
 
-    def __init__(self, simulator: NetworkStepper, signal: Signal, ramp: CollisionRamp, torn_strain: float, mode: str) -> None:
-        if mode not in ("fixed", "captured"):
-            raise ValueError(f"trainer.step is {mode!r}; choose auto, plain, fixed or captured")
+    def __init__(self, simulator: NetworkStepper, signal: Signal, torn_strain: float, mode: str) -> None:
         if mode == "captured" and not has_graphs(simulator.gravity.device):
             raise ValueError("trainer.step=captured needs device=cuda, a CPU has no graphs to replay; use fixed or plain")
-        reason = refusal(simulator, ramp)
-        if reason is not None:
-            raise ValueError(f"trainer.step={mode}: {reason}; use trainer.step=plain")
         self.simulator, self.signal, self.torn_strain, self.mode = simulator, signal, torn_strain, mode
         self._plans: dict[Any, _Plan] = {}
 
-    def __call__(self, parts: Sequence[Part], potential: Potential) -> Update:
+    def __call__(self, parts: Sequence[TrainingStep], potential: Potential) -> Update:
         """One update of the scenes, one after the other; the gradients of their mean are with the parameters.
 
         Raises:
@@ -174,7 +170,7 @@ class CapturedUpdates:
             torch.cat([outcome.lost for outcome in outcomes]),
         )
 
-    def _take(self, part: Part, potential: Potential, alone: bool) -> _Outcome:
+    def _take(self, part: TrainingStep, potential: Potential, alone: bool) -> _Outcome:
         problem = StepProblem(part.cloth, part.state, part.step, gravity=self.simulator.gravity)
         if problem.num_scenes > 1 or problem.step.attachments is not None:
             raise ValueError("scenes with fasteners have no update of fixed shapes: use trainer.step=plain")
@@ -304,7 +300,7 @@ class _Function:
         gradient = gradient * cloth.free.unsqueeze(1)
         residual = relative_gradient(problem, gradient)
         surrogate = surrogate_of(problem, prediction, gradient, residual, owner.signal)
-        measured = measure(problem, energies, acc, acc, residual, owner.signal)
+        measured = figures_of(problem, energies, acc, acc, residual, owner.signal)
         lost = is_lost(cloth, next_pos, owner.torn_strain)
         numbers = torch.cat([num_found.to(measured), lost.to(measured), measured])
         return surrogate, (next_pos, simulator.next_velocity(problem, prediction).detach(), numbers)
@@ -322,27 +318,25 @@ class _Signal(nn.Module):
 
 
 def make_captured(
-    mode: str, simulator: NetworkStepper, signal: Signal, ramp: CollisionRamp, torn_strain: float, closed: bool
+    simulator: NetworkStepper, settings: TrainerSettings, torn_strain: float, ranks: int = 1
 ) -> CapturedUpdates | None:
-    """Who takes the updates that have a form of fixed shapes; None: nobody does.
+    """Who takes the updates that have a form of fixed shapes, by ``trainer.step``; None: nobody does.
 
-    Args:
-        mode: ``trainer.step``; ``auto``: captured where there are graphs and the model has such updates.
-        closed: gradients are shared with other processes, or latents computed again on the way back.
+    By itself that is a CUDA graph, where there are graphs and the model has such updates.
 
     Raises:
-        ValueError: what ``mode`` asks for cannot be had.
+        ValueError: what is asked for cannot be had.
     """
-    if mode == "plain" or (mode == "auto" and (closed or not has_graphs(simulator.gravity.device))):
-        return None
+    mode, refused = settings.step, refusal(simulator, settings.collision)
+    if ranks > 1 or settings.activation_checkpointing:
+        refused = "several processes and trainer.activation_checkpointing have updates operation by operation alone"
     if mode == "auto":
-        return None if refusal(simulator, ramp) else CapturedUpdates(simulator, signal, ramp, torn_strain, "captured")
-    if closed:
-        raise ValueError(
-            f"trainer.step={mode}: several processes and trainer.activation_checkpointing have updates operation by operation "
-            "alone; use trainer.step=plain"
-        )
-    return CapturedUpdates(simulator, signal, ramp, torn_strain, mode)
+        mode = "plain" if refused or not has_graphs(simulator.gravity.device) else "captured"
+    if mode == "plain":
+        return None
+    if refused:
+        raise ValueError(f"trainer.step={mode}: {refused}; use trainer.step=plain")
+    return CapturedUpdates(simulator, Signal(settings.signal), torn_strain, mode)
 
 
 def refusal(simulator: NetworkStepper, ramp: CollisionRamp) -> str | None:

@@ -95,11 +95,22 @@ def test_a_rollout_is_the_one_of_the_cpu(ran: Any, name: str) -> None:
     assert bool(found["recorded"]) == ("captured" in name)
 
 
-def test_a_training_learns_the_same_and_resumes_to_the_last_bit(ran: Any) -> None:
-    found = ran("training")
+@pytest.mark.parametrize("name", ["training", pytest.param("training captured", marks=pytest.mark.slow)])
+def test_a_training_learns_the_same_and_resumes_to_the_last_bit(ran: Any, name: str) -> None:
+    found = ran(name)
     assert set(found["codes"].values()) == {0}, found["text"]
     assert found["same"]
     assert found["apart"] < LEARNED
+
+
+def test_a_captured_update_starts_few_kernels(ran: Any) -> None:
+    """Beside its graph those of the optimiser are left; the host reads what was measured, the norm and where the cloth is."""
+    found = ran("launches of an update")
+    assert {one["code"] for one in found.values()} == {0}, found
+    (plain, waits), (captured, reads) = (found[step]["launches and waits"] for step in ("plain", "captured"))
+    assert captured + 1 <= 183 < plain / 4
+    assert reads <= 4 < waits
+    assert len(found["captured"]["recorded"]) == 1
 
 
 @pytest.mark.slow

@@ -22,6 +22,12 @@ from typing import Any
 import standin
 import torch
 from safetensors.torch import load_file
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+#: Operations that start nothing.
+VIEWS = ("view", "_unsafe_view", "t", "transpose", "permute", "expand", "slice", "select", "split", "split_with_sizes",
+         "unsqueeze", "squeeze", "unbind", "alias", "detach", "as_strided")  # fmt: skip
 
 SHORT = ("num_frames=4", "video=none", "sheet=false")
 NETWORK = ("checkpoint=quickstart", "refine=0", "kernels=torch")
@@ -115,9 +121,9 @@ def between(*paths: Path) -> float:
     return most if most == most else float("inf")
 
 
-def train(folder: Path) -> dict[str, object]:
+def train(folder: Path, *more: str) -> dict[str, object]:
     """Four updates on the CPU and on the device, and there the last two again, resumed."""
-    words = (*TRAINING, "trainer.iterations=4", "trainer.keep_at=[2]")
+    words = (*TRAINING, "trainer.iterations=4", "trainer.keep_at=[2]", *more)
     codes = {device: command("train", *words, device, folder) for device in ("cpu", "standin")}
     shutil.copytree(folder / "standin", folder / "half" / "standin")
     shutil.copy(next((folder / "standin" / "kept").glob("*.pt")), folder / "half" / "standin" / "checkpoint.pt")
@@ -129,6 +135,48 @@ def train(folder: Path) -> dict[str, object]:
         "same": same,
         "apart": max(float((whole[key].double() - cpu[key].double()).abs().max()) for key in whole),
     }
+
+
+class Launches(TorchDispatchMode):
+    """Counts operations on the device; those on lists of tensors, which are a kernel or two, once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = function(*args, **(kwargs or {}))
+        given = tree_leaves((args, kwargs, out))
+        here = any(isinstance(one, torch.Tensor) and one.device.type == "standin" for one in given)
+        self.count += here and function._opname not in (*VIEWS, "empty", "empty_like", "empty_strided", "new_empty")
+        return out
+
+
+def launches(folder: Path) -> dict[str, object]:
+    """Operations and waits in the cheapest update of the paper's model, one in which no scene begins, by how it is taken."""
+    from hood.training.trainer import Trainer
+
+    update, found = Trainer.update, {}
+    words = ("experiment=paper_fast", "model.latent_dim=8", *TRAINING[2:], "trainer.iterations=9", "trainer.horizon.every=2")
+    words += ("trainer.collision.begin_iteration=2", "trainer.collision.end_iteration=9", "trainer.schedule.every=9")
+    for step in ("plain", "captured"):
+        counted: list[tuple[int, int]] = []
+
+        def counting(trainer: Any, counted: list[tuple[int, int]] = counted) -> dict[str, float]:
+            torch.standin.forget()
+            with Launches() as launched:
+                report = update(trainer)
+            calls = torch.standin.counts()
+            counted.append((launched.count, sum(number for name, number in calls.items() if name.startswith("sync"))))
+            return report
+
+        Trainer.update = counting  # type: ignore[method-assign]
+        try:
+            code = command("train", *words, f"trainer.step={step}", "standin", folder / step)
+        finally:
+            Trainer.update = update  # type: ignore[method-assign]
+        found[step] = {"code": code, "launches and waits": min(counted[1:]), "recorded": list(standin.recorded)}
+    return found
 
 
 def evaluate(folder: Path) -> dict[str, object]:
@@ -204,7 +252,15 @@ def raises(function: Callable[[], object]) -> bool:
     return False
 
 
-OTHERS = {"training": train, "evaluation": evaluate, "benchmark": benchmark, "the device alone": alone, "sums": sums}
+OTHERS = {
+    "training": train,
+    "training captured": lambda folder: train(folder, "trainer.step=captured", "trainer.kernels=torch"),
+    "launches of an update": launches,
+    "evaluation": evaluate,
+    "benchmark": benchmark,
+    "the device alone": alone,
+    "sums": sums,
+}
 
 if __name__ == "__main__":
     main(Path(sys.argv[1]), sys.argv[2:])

@@ -21,7 +21,7 @@ from hood.training import updates
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
 from hood.training.settings import Signal, TrainerSettings
-from hood.training.slots import Part, Slots
+from hood.training.slots import Slots, TrainingStep
 from hood.training.trainer import Trainer
 from hood.training.updates import CapturedUpdates, make_captured, plain_update
 
@@ -31,9 +31,8 @@ EDGES = {"features": "physical", "output": "edges"}
 LEVELS = "1x(mesh+coarse0) 1x(coarse0+coarse1) 1x(mesh+coarse0)"
 #: float32 sums in another order; a gradient is compared with the longest of its tensor.
 APART = 2e-4
-#: A weight of contact that changes from update to update.
+#: A weight of contact that changes.
 RAMP = CollisionRamp(1e5, 5e5, 0, 4)
-STEADY = CollisionRamp()
 
 
 def tiny(options: dict[str, Any]) -> NetworkStepper:
@@ -47,7 +46,9 @@ def scenes(body: Body, garments: dict[str, Garment], walk: PoseSequence) -> Scen
     return SceneSampler(body, [garments["tank"], garments["skirt"]], [walk.window(0, 90)])
 
 
-def both(simulator: NetworkStepper, parts: list[Part], whole: Part, captured: CapturedUpdates, weight: float) -> None:
+def both(
+    simulator: NetworkStepper, parts: list[TrainingStep], whole: TrainingStep, captured: CapturedUpdates, weight: float
+) -> None:
     """An update both ways, from the same weights and statistics: they must agree."""
     potential = CollisionRamp(weight, weight).apply(default_potential(), 0)
     simulator.use_potential(for_networks(potential))
@@ -87,7 +88,7 @@ def both(simulator: NetworkStepper, parts: list[Part], whole: Part, captured: Ca
 @pytest.mark.parametrize("options", [PAPER, PASSES, EDGES], ids=["paper", "passes", "edges"])
 def test_a_scene_alone(options: dict[str, Any], signal: str, scenes: SceneSampler) -> None:
     simulator = tiny(options)
-    captured = CapturedUpdates(simulator, Signal(signal), STEADY, 1.5, "fixed")
+    captured = CapturedUpdates(simulator, Signal(signal), 1.5, "fixed")
     slots = Slots(scenes, simulator, 1, 0, 2, workers=0)
     for _ in range(7):  # more than two scenes of a garment: one plan has to fit several
         parts = slots.each(1)
@@ -98,7 +99,7 @@ def test_a_scene_alone(options: dict[str, Any], signal: str, scenes: SceneSample
 
 def test_a_rising_weight_of_contact_is_read_anew(scenes: SceneSampler) -> None:
     simulator = tiny(PAPER)
-    captured = CapturedUpdates(simulator, Signal("potential"), RAMP, 1.5, "fixed")
+    captured = CapturedUpdates(simulator, Signal("potential"), 1.5, "fixed")
     part = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
     for weight in (1e5, 1e6):
         both(simulator, part, part[0], captured, weight)
@@ -107,7 +108,7 @@ def test_a_rising_weight_of_contact_is_read_anew(scenes: SceneSampler) -> None:
 
 def test_a_batch_is_the_mean_of_its_scenes(scenes: SceneSampler) -> None:
     simulator = tiny(PASSES)
-    captured = CapturedUpdates(simulator, Signal("scaled"), STEADY, 1.5, "fixed")
+    captured = CapturedUpdates(simulator, Signal("scaled"), 1.5, "fixed")
     slots = Slots(scenes, simulator, 3, 0, 2, workers=0)
     both(simulator, slots.each(1), slots.batch(1), captured, 5e5)
 
@@ -115,7 +116,7 @@ def test_a_batch_is_the_mean_of_its_scenes(scenes: SceneSampler) -> None:
 def test_more_edges_than_places_make_the_update_anew(scenes: SceneSampler, monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = tiny(PAPER)
     monkeypatch.setattr(updates, "first_capacity", lambda *_: Capacity(2, 2))
-    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1.5, "fixed")
+    captured = CapturedUpdates(simulator, Signal("potential"), 1.5, "fixed")
     parts = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
     both(simulator, parts, parts[0], captured, 5e5)
     (plan,) = captured._plans.values()
@@ -124,7 +125,7 @@ def test_more_edges_than_places_make_the_update_anew(scenes: SceneSampler, monke
 
 def test_a_torn_cloth_is_lost(scenes: SceneSampler) -> None:
     simulator = tiny(PAPER)
-    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1e-6, "fixed")
+    captured = CapturedUpdates(simulator, Signal("potential"), 1e-6, "fixed")
     parts = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
     assert captured(parts, default_potential()).read()[1] == [True]
 
@@ -146,26 +147,26 @@ def test_rows_that_are_not_filled_do_not_count(decay: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "options, ramp, closed, mode, words",
+    "options, settings, ranks, words",
     [
-        (PAPER, STEADY, False, "captured", "needs device=cuda"),
-        (PAPER, STEADY, True, "fixed", "several processes"),
-        (PAPER | {"layer_radius": 0.03}, STEADY, False, "fixed", "edges between layers"),
-        (PAPER | {"frame_dt": 1 / 30}, STEADY, False, "fixed", "counts in frames"),
-        (PASSES, RAMP, False, "fixed", "rises"),
+        (PAPER, {"step": "captured"}, 1, "needs device=cuda"),
+        (PAPER, {}, 2, "several processes"),
+        (PAPER, {"activation_checkpointing": True}, 1, "activation_checkpointing"),
+        (PAPER | {"layer_radius": 0.03}, {}, 1, "edges between layers"),
+        (PAPER | {"frame_dt": 1 / 30}, {}, 1, "counts in frames"),
+        (PASSES, {"collision": RAMP}, 1, "rises"),
     ],
 )
-def test_what_has_no_such_form_is_refused(
-    options: dict[str, Any], ramp: CollisionRamp, closed: bool, mode: str, words: str
-) -> None:
+def test_what_has_no_such_form_is_refused(options: dict[str, Any], settings: dict[str, Any], ranks: int, words: str) -> None:
+    given = TrainerSettings(**{"step": "fixed", "collision": CollisionRamp(), **settings})
     with pytest.raises(ValueError, match=words):
-        make_captured(mode, tiny(options), Signal("potential"), ramp, 1.5, closed)
-    assert make_captured("auto", tiny(options), Signal("potential"), ramp, 1.5, closed) is None  # a CPU has no graphs
+        make_captured(tiny(options), given, 1.5, ranks)
+    assert make_captured(tiny(options), replace(given, step="auto"), 1.5, ranks) is None  # a CPU has no graphs
 
 
 def test_energies_that_search_for_more_are_refused(scenes: SceneSampler) -> None:
     simulator = tiny(PAPER)
-    captured = CapturedUpdates(simulator, Signal("potential"), STEADY, 1.5, "fixed")
+    captured = CapturedUpdates(simulator, Signal("potential"), 1.5, "fixed")
     with pytest.raises(ValueError, match="step=plain"):
         captured(Slots(scenes, simulator, 1, 0, 2, workers=0).each(1), coded_potential())
 

@@ -21,8 +21,7 @@ from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
 from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
-from hood.steppers.static_shapes.newton_frame import NewtonFrame
-from hood.steppers.static_shapes.newton_pieces import FixedSystem, MaskedStep
+from hood.steppers.static_shapes.newton_pieces import FixedSystem, MaskedStep, NewtonFrame
 from hood.steppers.static_shapes.problem import (
     Constants,
     problem_from,

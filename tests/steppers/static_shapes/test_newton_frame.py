@@ -16,7 +16,7 @@ from hood.solver.system.plan import plan_for
 from hood.steppers.newton import NewtonStepper
 from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.newton import CapturedNewton
-from hood.steppers.static_shapes.newton_frame import NewtonFrame
+from hood.steppers.static_shapes.newton_pieces import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 
 POTENTIAL = default_potential()
