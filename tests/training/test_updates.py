@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from hood.energies.self_contact import for_networks
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.static_shapes import Capacity
 from hood.steppers.network import NetworkStepper, build_simulator
+from hood.steppers.static_shapes.cuda_graph import trace
+from hood.tensors.precision import assumed
 from hood.training import updates
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
@@ -183,3 +186,22 @@ def test_a_training_learns_the_same(scenes: SceneSampler, tmp_path: Path) -> Non
         weights[step] = trainer.averaged().state_dict()
     for name, value in weights["plain"].items():
         torch.testing.assert_close(weights["fixed"][name], value, rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_the_kernels_of_a_gpu_are_part_of_it(scenes: SceneSampler) -> None:
+    """Forward and backward: tracing fails where something asks the device, or has no gradient of fixed shape."""
+    simulator = tiny(PAPER | {"latent_dim": 16})
+    captured = CapturedUpdates(simulator, Signal("potential"), 1.5, "fixed")
+    (part,) = Slots(scenes, simulator, 1, 0, 2, workers=0).each(1)
+    captured([part], default_potential())
+    (plan,) = captured._plans.values()
+    plan._run._owner.mode = "captured"  # searches as on a GPU
+    with assumed():
+        traced = trace(plan._run, plan._memory, fold=False)
+    names = Counter(str(node.target) for node in traced.graph.nodes if node.op == "call_function")
+    own = {name.split(".")[1]: count for name, count in names.items() if name.startswith("hood.")}
+    sets = 3 * 3  # steps, edge sets of a step
+    assert own["step_edges"] == own["edge_gradients"] == sets
+    assert own["step_nodes"] == 3
+    assert own["mlp_tail"] == 5  # encoders of nodes and four kinds of edges; the decoder has no layer norm
+    assert own["tail_gradients"] == own["step_nodes"] + own["mlp_tail"]

@@ -176,11 +176,6 @@ def _(nodes: Tensor, received: Tensor, parameters: Sequence[Tensor], eps: float,
     return torch.empty_like(nodes)
 
 
-@step_edges.register_fake
-def _(*arguments: Any) -> None:
-    return None
-
-
 @torch.library.custom_op("hood::mlp_tail", mutates_args=())
 def mlp_tail(hidden: Tensor, residual: Tensor | None, parameters: Sequence[Tensor], eps: float, precision: str) -> Tensor:
     """A network behind its first layer, ``hidden`` (N, d) before the ReLU, with ``tail_parameters``; plus ``residual`` (N, d),
@@ -327,9 +322,14 @@ def _edge_gradients(
     parts = torch.zeros(count, programs, 5 * width, dtype=torch.float32, device=low.device)
     back, squares = list[Tensor](), list[Tensor]()
     for index, (one, latent, group) in enumerate(zip(setting.sets, latents, groups, strict=True)):
+        edges, rows, (first, _, *tail) = one.part.edges, one.part.rows, group
+        grad = grad_latents[index].contiguous()
+        found = torch.empty_like(latent) if rows is None else grad.clone()
+        factors = latent.new_empty(6, edges.num_edges, width)
+        where = [edges.receivers, edges.senders, edges.nodes, edges.offsets, edges.reverse]
+        given = latent, tables, 2 * width * index, where, rows, [first[:, 2 * width :], *tail[:5]]
         at_node = grad_seen[:, (1 + one.place) * width :]
-        given = (grad_latents[index].contiguous(), at_node, grad_tables, parts[index])
-        found, factors = _set_gradients(one, setting.precision, latent, tables, 2 * width * index, group, *given)
+        edge_gradients(*given, grad, at_node, found, factors, grad_tables, parts[index], one.eps, setting.precision)
         before, behind = factors.split(3)
         back.append(found)
         squares.append((behind.transpose(1, 2) @ before).to(like))
@@ -343,41 +343,41 @@ def _edge_gradients(
     return back, of_edges, grad_tables @ weights
 
 
-def _set_gradients(
-    one: _Set,
-    precision: str,
+@torch.library.custom_op("hood::edge_gradients", mutates_args=("back", "factors", "grad_tables", "parts"))
+def edge_gradients(
     latent: Tensor,
     tables: Tensor,
     column: int,
-    group: Sequence[Tensor],
+    index: Sequence[Tensor],
+    rows: Tensor | None,
+    parameters: Sequence[Tensor],
     grad_updated: Tensor,
     grad_received: Tensor,
+    back: Tensor,
+    factors: Tensor,
     grad_tables: Tensor,
     parts: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """The gradient of a set's latents, and the factors (6, N, d) of those of three weights; writes to the set's columns of
-    ``grad_tables``, and to ``parts``."""
-    edges, rows, count, width = one.part.edges, one.part.rows, one.part.edges.num_edges, latent.shape[1]
-    first, _, *tail = group
-    own, tiles, shape = first[:, 2 * width :], -(-count // tile_of(width, latent.dtype)), _shape(width, latent.dtype)
-    back, factors = torch.empty_like(latent) if rows is None else grad_updated.clone(), latent.new_empty(6, count, width)
-    which = (
-        latent,
-        tables,
-        tables.stride(0),
-        column,
-        edges.receivers,
-        edges.senders,
-        edges.receivers if rows is None else rows,
-    )
-    given = (own, own.stride(0), *tail[:5], grad_updated, grad_received, grad_received.stride(0))
+    eps: float,
+    precision: str,
+) -> None:
+    """Through :func:`step_edges`: writes ``back`` (L, d), ``factors`` (6, N, d), columns of ``grad_tables`` and ``parts``.
+
+    Args:
+        index: receivers, senders, nodes, offsets and reverse of the edge set.
+        rows: (N,) rows of ``latent`` that take part, the others of ``back`` stay; None: all of them.
+    """
+    receivers, senders, nodes, offsets, reverse = index
+    count, width = len(receivers), latent.shape[1]
+    tiles, shape = -(-count // tile_of(width, latent.dtype)), _shape(width, latent.dtype)
+    own, *tail = parameters
+    which = (latent, tables, tables.stride(0), column, receivers, senders, receivers if rows is None else rows)
+    given = (own, own.stride(0), *tail, grad_updated, grad_received, grad_received.stride(0))
     options = options_of(width, latent, precision)
     _gradient_kernels().edges_back[(min(len(parts), tiles),)](
-        *which, *given, back, factors, parts, count, tiles, one.eps, **options, **shape, SOME=rows is not None
+        *which, *given, back, factors, parts, count, tiles, eps, **options, **shape, SOME=rows is not None
     )
-    where = (edges.nodes, edges.offsets, edges.reverse, grad_tables, grad_tables.stride(0), column, len(edges.nodes))
-    _gradient_kernels().ends_back[(-(-len(edges.nodes) // shape["TILE"]),)](factors[3], *where, **shape)
-    return back, factors
+    where = (nodes, offsets, reverse, grad_tables, grad_tables.stride(0), column, len(nodes))
+    _gradient_kernels().ends_back[(-(-len(nodes) // shape["TILE"]),)](factors[3], *where, **shape)
 
 
 class _TailStep(torch.autograd.Function):
@@ -412,20 +412,32 @@ def _tail_gradients(
     programs, back, factors = min(PROGRAMS, max(tiles, 1)), torch.empty_like(hidden), hidden.new_empty(4, count, width)
     parts = torch.zeros(programs, 5 * width, dtype=torch.float32, device=hidden.device)
     if count:
-        given = (hidden, grad, *parameters[:5], back, factors, parts, count, tiles, eps)
-        _gradient_kernels().tail_back[(programs,)](
-            *given, **options_of(width, hidden, precision), **_shape(width, hidden.dtype)
-        )
+        tail_gradients(hidden, grad, list(parameters[:5]), back, factors, parts, eps, precision)
     before, behind = factors.split(2)
     second, third = (behind.transpose(1, 2) @ before).to(dtype)
     one, two, three, scale, shift = parts.sum(dim=0).to(dtype).split(width)
     return back, one, [second, two, third, three, scale, shift]
 
 
-def _ends(part: Subset) -> tuple[Tensor, Tensor, Tensor]:
-    """Receivers, senders, and rows of the set; any array where these are all of them."""
-    edges = part.edges
-    return edges.receivers, edges.senders, edges.receivers if part.rows is None else part.rows
+@torch.library.custom_op("hood::tail_gradients", mutates_args=("back", "factors", "parts"))
+def tail_gradients(
+    hidden: Tensor,
+    grad: Tensor,
+    parameters: Sequence[Tensor],
+    back: Tensor,
+    factors: Tensor,
+    parts: Tensor,
+    eps: float,
+    precision: str,
+) -> None:
+    """Through :func:`mlp_tail`: writes ``back`` (N, d), ``factors`` (4, N, d) and ``parts``."""
+    count, width = hidden.shape
+    given = (hidden, grad, *parameters, back, factors, parts, count, -(-count // tile_of(width, hidden.dtype)), eps)
+    _gradient_kernels().tail_back[(len(parts),)](*given, **options_of(width, hidden, precision), **_shape(width, hidden.dtype))
+
+
+for _writes in (step_edges, edge_gradients, tail_gradients):  # without values there is nothing to write
+    _writes.register_fake(lambda *arguments: None)
 
 
 def _groups(parameters: Sequence[Tensor]) -> list[Sequence[Tensor]]:
