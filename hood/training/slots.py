@@ -162,6 +162,11 @@ class Slots:
         return math.inf if self.whole else self.torn_strain
 
     @property
+    def most_scenes(self) -> int:
+        """Of an update, over all processes."""
+        return max(bucket.count for bucket in self.buckets)
+
+    @property
     def num_slots(self) -> int:
         """Rollouts of all buckets, over all processes."""
         return self.buckets[-1].first + self.buckets[-1].count

@@ -106,7 +106,7 @@ class Trainer:
             for module in simulator.modules():
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
-        self._captured = make_captured(simulator, settings, self.slots.ending_strain, ranks)
+        self._captured = make_captured(simulator, settings, self.slots.ending_strain, self.slots.most_scenes, ranks)
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
         self.iteration, self.earlier, self.rollbacks, self.best = 0, earlier, 0, math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes

@@ -131,6 +131,11 @@ def plain_update(
     )
 
 
+#: Scenes of an update that graphs take one after the other, unless asked for. To start the 6,000 kernels of a plain update
+#: takes about as long as eight graphs of 1,000 vertices are computed; that follows from counts and was not measured.
+MOST_SCENES = 8
+
+
 class CapturedUpdates:
     """Takes the updates of plain scenes with fixed shapes: search, features, network, energies and the way back to the weights
     are one function of tensors, which waits for nothing on the host.
@@ -155,6 +160,9 @@ class CapturedUpdates:
 
     def __call__(self, parts: Sequence[TrainingStep], potential: Potential) -> Update:
         """One update of the scenes, one after the other; the gradients of their mean are with the parameters.
+
+        Args:
+            potential: the same in every update, but for its weight of contact.
 
         Raises:
             ValueError: a scene or the potential has no form of fixed shapes; the message says what to use.
@@ -318,11 +326,11 @@ class _Signal(nn.Module):
 
 
 def make_captured(
-    simulator: NetworkStepper, settings: TrainerSettings, torn_strain: float, ranks: int = 1
+    simulator: NetworkStepper, settings: TrainerSettings, torn_strain: float, scenes: int = 1, ranks: int = 1
 ) -> CapturedUpdates | None:
     """Who takes the updates that have a form of fixed shapes, by ``trainer.step``; None: nobody does.
 
-    By itself that is a CUDA graph, where there are graphs and the model has such updates.
+    By itself that is a CUDA graph, where there are graphs, the model has such updates, and one has few ``scenes``.
 
     Raises:
         ValueError: what is asked for cannot be had.
@@ -331,7 +339,7 @@ def make_captured(
     if ranks > 1 or settings.activation_checkpointing:
         refused = "several processes and trainer.activation_checkpointing have updates operation by operation alone"
     if mode == "auto":
-        mode = "plain" if refused or not has_graphs(simulator.gravity.device) else "captured"
+        mode = "captured" if has_graphs(simulator.gravity.device) and not refused and scenes <= MOST_SCENES else "plain"
     if mode == "plain":
         return None
     if refused:

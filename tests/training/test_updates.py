@@ -163,8 +163,18 @@ def test_rows_that_are_not_filled_do_not_count(decay: float) -> None:
 def test_what_has_no_such_form_is_refused(options: dict[str, Any], settings: dict[str, Any], ranks: int, words: str) -> None:
     given = TrainerSettings(**{"step": "fixed", "collision": CollisionRamp(), **settings})
     with pytest.raises(ValueError, match=words):
-        make_captured(tiny(options), given, 1.5, ranks)
-    assert make_captured(tiny(options), replace(given, step="auto"), 1.5, ranks) is None  # a CPU has no graphs
+        make_captured(tiny(options), given, 1.5, ranks=ranks)
+    assert make_captured(tiny(options), replace(given, step="auto"), 1.5, ranks=ranks) is None  # a CPU has no graphs
+
+
+def test_a_gpu_takes_few_scenes_by_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(updates, "has_graphs", lambda device: True)
+    settings = TrainerSettings(collision=CollisionRamp())
+    captured = make_captured(tiny(PAPER), settings, 1.5, scenes=8)
+    assert captured is not None
+    assert captured.mode == "captured"
+    assert make_captured(tiny(PAPER), settings, 1.5, scenes=9) is None
+    assert make_captured(tiny(PAPER), replace(settings, step="captured"), 1.5, scenes=9) is not None
 
 
 def test_energies_that_search_for_more_are_refused(scenes: SceneSampler) -> None:
