@@ -126,6 +126,15 @@ def test_the_benchmark_for_a_gpu_goes_through_its_jobs(ran: Any) -> None:
 
 
 @pytest.mark.slow
+def test_the_checks_of_a_gpu_hold_there(ran: Any) -> None:
+    """All of them are taken, and every number is held to its bound."""
+    found = ran("checks")
+    assert found["written"] == len(found["lines"]) == 15
+    assert not [line for line in found["lines"] if line[2] == "no"]
+    assert all(re.match(r"[\d.e+-]+ ", line[1]) for line in found["lines"]), found["lines"]
+
+
+@pytest.mark.slow
 def test_every_command_of_the_docs_runs_there(built: dict[str, str], tmp_path: Path) -> None:
     """Rollouts, trainings and evaluations: half an hour of a core."""
     found = ask(built, "documented.py", tmp_path)

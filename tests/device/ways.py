@@ -203,6 +203,42 @@ def benchmark(folder: Path) -> dict[str, object]:
     return {"ways": sorted({f"{row['method']} {row['way']}" for row in rows})}
 
 
+#: A check of a GPU as it is, and one that a core can take.
+SMALLER = (
+    ("trainer.statistics_iterations=10", "trainer.statistics_iterations=2"),
+    ("trainer.iterations=60", "trainer.iterations=12"),
+    ("trainer.log_every=10", "trainer.log_every=2"),
+    ('"experiment=paper_fast", "trainer.schedule.every=60", "trainer.horizon.every=20"',
+     '"experiment=paper_fast", "trainer.schedule.every=12", "trainer.horizon.every=4", "model.latent_dim=16", '
+     '"data.garments=[tshirt]"'),
+    ("trainer.collision.begin_iteration=20", "trainer.collision.begin_iteration=4"),
+    ("trainer.collision.end_iteration=40", "trainer.collision.end_iteration=8"),
+    ('"experiment=quickstart"', '"experiment=quickstart", "model=small", "data.garments=[tshirt]"'),
+    ("num_frames=10", "num_frames=3"),
+    ("checkpoint=quickstart", "checkpoint=small3"),
+    ("models=[quickstart,newton]", "models=[small3,newton]"),
+)  # fmt: skip
+#: Begins a command of hood there.
+ON_STANDIN = "import sys, standin; from hood.cli.main import main; sys.exit(main())"
+
+
+def checks(folder: Path) -> dict[str, object]:
+    """The lines of ``benchmarks/gpu_checks.py``."""
+    place = Path(__file__).parents[2] / "benchmarks" / "gpu_checks.py"
+    text = standin.otherwise(place.read_text(encoding="utf-8"))
+    for whole, smaller in SMALLER:
+        assert whole in text, whole
+        text = text.replace(whole, smaller)
+    module = types.ModuleType("gpu_checks_on_standin")
+    sys.modules[module.__name__] = module
+    exec(compile(text, str(place), "exec"), vars(module))
+    vars(module).update(COMMAND=(sys.executable, "-P", "-c", ON_STANDIN))
+    folder.mkdir(parents=True)
+    lines = vars(module)["run"](20.0, 300.0, folder / "checks.csv")
+    written = list(csv.DictReader((folder / "checks.csv").read_text().splitlines()))
+    return {"lines": [[line.check, line.found, line.holds] for line in lines], "written": len(written)}
+
+
 def alone(_: Path) -> dict[str, object]:
     """What the device makes of calls that a GPU would refuse, without hood."""
     here = torch.ones(4, device="standin")
@@ -258,6 +294,7 @@ OTHERS = {
     "launches of an update": launches,
     "evaluation": evaluate,
     "benchmark": benchmark,
+    "checks": checks,
     "the device alone": alone,
     "sums": sums,
 }

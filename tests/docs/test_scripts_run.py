@@ -110,7 +110,7 @@ RUN = (
 NOT_RUN = {
     r"build_assets\.py": "writes the data of the package anew, with packages from PyPI; tests/tools/assets tests that",
     r"gallery\.py": "21 rollouts of 60 frames at 4,000 vertices",
-    r"gpu\.py": "needs a CUDA device",
+    r"gpu(_checks)?\.py": "needs a CUDA device",
     r"heads\.py (controls|models)": "reads networks that benchmarks/recipes.py trains in hours",
     r"kills\.py": "starts and kills trainings for minutes; tests/training/test_kills.py does so once",
     r"minima\.py": "a hundred minimisations to the end, minutes",
