@@ -127,6 +127,18 @@ def same_twice(words: Sequence[str], name: str, step: str = "step=plain") -> Cal
     return check
 
 
+def layers_as_on_cpu(commands: Commands) -> float:
+    """Relative difference of the number of contacts of cloth with cloth: from the last bit on, such cloth goes other ways."""
+    both = []
+    for device in ("cpu", DEVICE):
+        place = commands.run(f"outfit {device}", *OUTFIT, f"device={device}")
+        told = json.loads((place / "summary.json").read_text())["cloth_contact"]
+        if told["used"] != "on" or told["crossed_pairs_max"]:
+            raise Failed(f"contact of layers on {device}: {told}")
+        both.append(told["contacts_max"])
+    return abs(both[1] - both[0]) / both[0]
+
+
 def trained(words: Sequence[str], name: str, *more: str) -> Callable[[Commands], float]:
     return lambda commands: rate(commands.run(f"{name} {' '.join(more)}", *words, *more, f"device={DEVICE}"))
 
@@ -158,7 +170,7 @@ CHECKS: list[Check] = [
     ("paper's network, captured updates", None, "1/s", trained(PAPER, "paper", "trainer.step=captured")),
     ("paper's network, captured from plain", 1e-2, "of the energy", learned_alike(PAPER, "paper")),
     ("solver, from the CPU's", 1e-6, "m", same_as_cpu(SOLVER, "solver")),
-    ("outfit with contact of layers, from the CPU's", 1e-6, "m", same_as_cpu(OUTFIT, "outfit")),
+    ("contacts of the layers of an outfit, from the CPU's", 0.05, "of them", layers_as_on_cpu),
     ("network captured, twice", 0.0, "m", same_twice(NETWORK, "network", "step=captured")),
     ("solver, twice", 0.0, "m", same_twice(SOLVER, "solver")),
     ("evaluation", None, "s", evaluated),

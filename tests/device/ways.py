@@ -214,7 +214,7 @@ SMALLER = (
     ("trainer.collision.begin_iteration=20", "trainer.collision.begin_iteration=4"),
     ("trainer.collision.end_iteration=40", "trainer.collision.end_iteration=8"),
     ('"experiment=quickstart"', '"experiment=quickstart", "model=small", "data.garments=[tshirt]"'),
-    ("num_frames=10", "num_frames=3"),
+    ("num_frames=10", "num_frames=4"),
     ("checkpoint=quickstart", "checkpoint=small3"),
     ("models=[quickstart,newton]", "models=[small3,newton]"),
 )  # fmt: skip
