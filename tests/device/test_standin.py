@@ -105,7 +105,7 @@ def test_a_training_learns_the_same_and_resumes_to_the_last_bit(ran: Any, name: 
 
 def test_a_captured_update_starts_few_kernels(ran: Any) -> None:
     """Beside its graph those of the optimiser are left; the host reads what was measured, the norm and where the cloth is."""
-    found = ran("launches of an update")
+    found = {step: ran("launches of an update")[step] for step in ("plain", "captured")}
     assert {one["code"] for one in found.values()} == {0}, found
     (plain, waits), (captured, reads) = (found[step]["launches and waits"] for step in ("plain", "captured"))
     assert captured + 1 <= 183 < plain / 4
