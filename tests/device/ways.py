@@ -25,10 +25,6 @@ from safetensors.torch import load_file
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-#: Operations that start nothing.
-VIEWS = ("view", "_unsafe_view", "t", "transpose", "permute", "expand", "slice", "select", "split", "split_with_sizes",
-         "unsqueeze", "squeeze", "unbind", "alias", "detach", "as_strided")  # fmt: skip
-
 SHORT = ("num_frames=4", "video=none", "sheet=false")
 NETWORK = ("checkpoint=quickstart", "refine=0", "kernels=torch")
 SOLVER = ("stepper=newton",)
@@ -141,14 +137,16 @@ class Launches(TorchDispatchMode):
     """Counts operations on the device; those on lists of tensors, which are a kernel or two, once."""
 
     def __init__(self) -> None:
+        from hood.steppers.static_shapes.cuda_graph import VIEWS
+
         super().__init__()
-        self.count = 0
+        self.count, self._nothing = 0, (*VIEWS, "empty", "empty_like", "empty_strided", "new_empty")
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = function(*args, **(kwargs or {}))
         given = tree_leaves((args, kwargs, out))
         here = any(isinstance(one, torch.Tensor) and one.device.type == "standin" for one in given)
-        self.count += here and function._opname not in (*VIEWS, "empty", "empty_like", "empty_strided", "new_empty")
+        self.count += here and function._opname not in self._nothing
         return out
 
 
