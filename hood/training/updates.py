@@ -145,16 +145,11 @@ class CapturedUpdates:
 
     Args:
         simulator: one that :func:`refusal` has nothing against.
-        mode: ``fixed``: one operation after the other; ``captured``: a CUDA graph of them, replayed at once.
+        mode: ``fixed``: one operation after the other; ``captured``, on CUDA: a graph of them, replayed at once.
         torn_strain: see :func:`hood.training.slots.is_lost`.
-
-    Raises:
-        ValueError: ``captured`` without CUDA.
     """
 
     def __init__(self, simulator: NetworkStepper, signal: Signal, torn_strain: float, mode: str) -> None:
-        if mode == "captured" and not has_graphs(simulator.gravity.device):
-            raise ValueError("trainer.step=captured needs device=cuda, a CPU has no graphs to replay; use fixed or plain")
         self.simulator, self.signal, self.torn_strain, self.mode = simulator, signal, torn_strain, mode
         self._plans: dict[Any, _Plan] = {}
 
@@ -342,6 +337,8 @@ def make_captured(
         mode = "captured" if has_graphs(simulator.gravity.device) and not refused and scenes <= MOST_SCENES else "plain"
     if mode == "plain":
         return None
+    if mode == "captured" and not has_graphs(simulator.gravity.device):
+        raise ValueError("trainer.step=captured needs device=cuda, a CPU has no graphs to replay; use fixed or plain")
     if refused:
         raise ValueError(f"trainer.step={mode}: {refused}; use trainer.step=plain")
     return CapturedUpdates(simulator, Signal(settings.signal), torn_strain, mode)
@@ -354,7 +351,7 @@ def refusal(simulator: NetworkStepper, ramp: CollisionRamp) -> str | None:
     if simulator.rules.frame_dt is not None:
         return "the model counts in frames"
     if simulator.network.kernels != "torch":
-        return "trainer.kernels=compiled computes outside of torch"
+        return "trainer.kernels=compiled computes outside of torch (trainer.kernels=torch does not)"
     if simulator.looks_at_potential and ramp.start != ramp.end:
         return "the model looks at a potential whose weight of contact rises"
     return None
