@@ -217,7 +217,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=90.0, help="seconds of one command")
     parser.add_argument("--csv", type=Path, default=None)
     args = parser.parse_args()
-    if DEVICE == "cuda" and not torch.cuda.is_available():
+    if not torch.cuda.is_available():
         raise SystemExit("gpu_checks.py needs a GPU that torch sees; benchmarks/gpu.py computes times without one")
     run(args.minutes, args.limit, args.csv)
 

@@ -168,7 +168,7 @@ class CollisionRamp:
 
     def require_its_weight(self, potential: Potential) -> None:
         """Raise ValueError where a term has a weight of its own, which the ramp would overwrite unsaid."""
-        for name, term in _weighted(potential).items():
+        for name, term in weighted_terms(potential).items():
             given = getattr(term, "weight", None)
             usual = inspect.signature(type(term)).parameters.get("weight")
             if given is None or given == self.end or (usual is not None and given == usual.default):
@@ -181,8 +181,8 @@ class CollisionRamp:
             )
 
 
-def _weighted(potential: Potential) -> dict[str, WeightedTerm]:
-    """Terms that have the weight of contact.
+def weighted_terms(potential: Potential) -> dict[str, WeightedTerm]:
+    """Terms that have the weight of contact, by name.
 
     Raises:
         ValueError: a term under these names cannot be given one.
@@ -202,7 +202,7 @@ def _weighted(potential: Potential) -> dict[str, WeightedTerm]:
 
 
 def _with_weight(potential: Potential, weight: float) -> Potential:
-    changed = {name: cast(Term, term.with_weight(weight)) for name, term in _weighted(potential).items()}
+    changed = {name: cast(Term, term.with_weight(weight)) for name, term in weighted_terms(potential).items()}
     return potential.with_terms(**changed)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,7 @@ from hood.energies.friction import Friction
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
-from hood.energies.term import Term, WeightedTerm, named
+from hood.energies.term import Term, named
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.static_shapes import Capacity, StaticLayout, lay_out
@@ -30,7 +30,7 @@ from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, 
 from hood.steppers.static_shapes.problem import altered, problem_from, settled_potential, step_inputs, step_shape
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
 from hood.tensors.precision import products
-from hood.training.curriculum import CollisionRamp
+from hood.training.curriculum import CollisionRamp, weighted_terms
 from hood.training.log import output_spread
 from hood.training.settings import Signal, TrainerSettings
 from hood.training.slots import TrainingStep, is_lost
@@ -65,15 +65,26 @@ MEASURED = ("loss", "relative_gradient", "output_spread")
 def figures_of(
     problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, output: Tensor, residual: Tensor, signal: Signal
 ) -> Tensor:
-    """:attr:`Update.measured`; ``output`` (V, 3) are the accelerations that the network gives, ``acc`` those of the step."""
+    """:attr:`Update.measured` (M,).
+
+    Args:
+        energies: (B,) [J] by name.
+        acc: (V, 3) m/s² of the step; ``output`` those that the network gives.
+        residual: (B,), the relative gradient.
+    """
     means = [value.mean() for value in energies.values()]
     loss = signal.loss(problem, energies, acc, residual).mean()
     return torch.stack([*means, loss, residual.median(), output_spread(output, problem.cloth.free).to(loss)])
 
 
 def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
-    """A number whose gradient is that of the training signal: the energies' own is put in at the output, so that no graph
-    through them is kept."""
+    """A number () whose gradient is that of the training signal: the energies' own is put in at the output, so that no graph
+    through them is kept.
+
+    Args:
+        gradient: (V, 3) N, of the energies at the prediction; zero at vertices that are not free.
+        residual: (B,), the relative gradient.
+    """
     scene = problem.cloth.vertex_scene
     weight = signal.weight(problem, residual)
     surrogate = (prediction.next_pos * (gradient * weight[scene].unsqueeze(1))).sum()
@@ -390,24 +401,21 @@ def _shape(problem: StepProblem) -> tuple[Any, ...]:
     return (*step_shape(problem, surface=True), tuple(values), tuple(value.shape for value in values.values()))
 
 
-def _ramped(potential: Potential) -> dict[str, Term]:
-    """The terms that have the weight of contact."""
-    return {name: potential.terms[name] for name in ("collision", "friction") if name in potential.terms}
-
-
 def _contact_weight(potential: Potential) -> float:
-    return float(next((getattr(term, "weight", 0.0) for term in _ramped(potential).values()), 0.0))
+    return float(next((getattr(term, "weight", 0.0) for term in weighted_terms(potential).values()), 0.0))
 
 
 def _weighing(potential: Potential, weight: Tensor) -> Potential:
     """The potential with a weight of contact that is read on the device."""
     changed: dict[str, Term] = {}
-    for name, term in _ramped(potential).items():
-        if isinstance(term, WeightedTerm) and term.with_weight(0.0) is term:
+    for name, term in weighted_terms(potential).items():
+        if term.with_weight(0.0) is term:
             continue
-        if getattr(type(term), "with_weight", None) not in _PLAINLY_WEIGHTED:
-            raise ValueError(f"{named(name, term)} has no weight that a recorded update could change: use trainer.step=plain")
-        changed[name] = copy.copy(term)
+        if type(term).with_weight not in _PLAINLY_WEIGHTED:
+            raise ValueError(
+                f"{named(name, cast(Term, term))} has no weight that a recorded update could change: use trainer.step=plain"
+            )
+        changed[name] = cast(Term, copy.copy(term))
         changed[name].weight = weight  # type: ignore[attr-defined]
     return potential.only({**potential.terms, **changed})
 
