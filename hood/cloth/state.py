@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hood.tensors.batch import concatenate, indexes
-from hood.tensors.dense import is_whole
+from hood.tensors.dense import add_rows, is_whole, sum_scenes
 
 
 @dataclass(frozen=True)
@@ -135,3 +135,9 @@ def _known_of_all(items: Sequence[Attachments], key: str, default: float) -> Ten
     like = next(values for values in given if values is not None)
     filled = [like.new_full((len(i.edges),), default) if v is None else v for i, v in zip(items, given, strict=True)]
     return torch.cat(filled)
+
+
+def centres_of(pos: Tensor, vertex_scene: Tensor, num_scenes: int) -> Tensor:
+    """(B, 3) m: means of the vertices of each scene, of positions (V, 3)."""
+    count = sum_scenes(pos.new_ones(len(vertex_scene)), vertex_scene, num_scenes).clamp_min(1)
+    return add_rows(pos.new_zeros(num_scenes, 3), vertex_scene, pos) / count[:, None]

@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import Cloth, build_cloth
-from hood.cloth.state import Attachments, State, StepInput
+from hood.cloth.state import Attachments, State, StepInput, centres_of
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
 from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
@@ -21,7 +21,6 @@ from hood.scene.start import free_stretch, leave_by_centroids, settle
 from hood.scene.untangle import Outfit, Separation, separate, smooth_out
 from hood.scene.worn import worst_part
 from hood.tensors.batch import to_device
-from hood.tensors.dense import add_rows, sum_scenes
 
 #: Time step [s] of the relaxing first step: inertia shrinks by 100, the paper's α (section 3.4).
 RELAXING_DT = 1.0 / 3.0
@@ -281,17 +280,18 @@ def dress(garment: Garment, motion: Motion, material: Material | None = None, si
     return Scene(cloth, garment, motion, 1.0 / motion.fps, sizes=sizes, fastening=fastening)
 
 
-def recentre(state: State, vertex_scene: Tensor) -> State:
-    """The same state with each scene's origin moved next to its cloth; world positions are unchanged."""
-    like = state.pos.new_ones(len(vertex_scene))
-    count = sum_scenes(like, vertex_scene, len(state.origin)).clamp_min(1)
-    centre = add_rows(state.pos.new_zeros(len(state.origin), 3), vertex_scene, state.pos) / count[:, None]
+def recentre(state: State, vertex_scene: Tensor, centres: Tensor | None = None) -> State:
+    """The same state with each scene's origin moved next to its cloth; world positions are unchanged.
+
+    Args:
+        centres: :func:`centres_of` the positions, on the CPU, where they are known; otherwise this waits for the device, once.
+    """
+    known = centres_of(state.pos, vertex_scene, len(state.origin)).cpu() if centres is None else centres
     # A broken cloth has no centre; its frame stays, so that the body can still be seen.
-    shift = torch.round(centre.nan_to_num(0.0, 0.0, 0.0) / (2 * _GRID)) * (2 * _GRID)
-    known = shift.cpu()  # waits for the device, once
-    if not bool(known.any()):
+    shift = torch.round(known.nan_to_num(0.0, 0.0, 0.0) / (2 * _GRID)) * (2 * _GRID)
+    if not bool(shift.any()):
         return state
-    return State(state.pos - shift[vertex_scene], state.vel, state.origin + known.to(torch.float64))
+    return State(state.pos - shift.to(state.pos)[vertex_scene], state.vel, state.origin + shift.to(torch.float64))
 
 
 def local_origin(position: np.ndarray, grid: float = _GRID) -> np.ndarray:

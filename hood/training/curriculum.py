@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
 from dataclasses import dataclass, replace
 from typing import cast
 
+from torch import Tensor
+
+from hood.energies.contact import Collision
+from hood.energies.friction import Friction
 from hood.energies.potential import Potential
 from hood.energies.term import Term, WeightedTerm, named
 
@@ -204,6 +209,30 @@ def weighted_terms(potential: Potential) -> dict[str, WeightedTerm]:
 def _with_weight(potential: Potential, weight: float) -> Potential:
     changed = {name: cast(Term, term.with_weight(weight)) for name, term in weighted_terms(potential).items()}
     return potential.with_terms(**changed)
+
+
+def contact_weight(potential: Potential) -> float:
+    """Of the terms that have it; 0 where there are none."""
+    return float(next((getattr(term, "weight", 0.0) for term in weighted_terms(potential).values()), 0.0))
+
+
+def with_weight_on_device(potential: Potential, weight: Tensor) -> Potential:
+    """The potential with a weight of contact () that is read on the device.
+
+    Raises:
+        ValueError: a term takes more from its weight than the factor that it is; the message says what to use.
+    """
+    changed: dict[str, Term] = {}
+    for name, term in weighted_terms(potential).items():
+        if term.with_weight(0.0) is term:
+            continue
+        if type(term).with_weight not in (Collision.with_weight, Friction.with_weight):
+            raise ValueError(
+                f"{named(name, cast(Term, term))} has no weight that a recorded update could change: use trainer.step=plain"
+            )
+        changed[name] = cast(Term, copy.copy(term))
+        changed[name].weight = weight  # type: ignore[attr-defined]
+    return potential.only({**potential.terms, **changed})
 
 
 def _require_least(part: str, settings: object, **least: int) -> None:

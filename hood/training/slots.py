@@ -196,7 +196,6 @@ class Slots:
         assert prepared is not None
         assert slot.state is not None
         scene, first = window.scene, slot.age == 0
-        slot.state = recentre(slot.state, scene.cloth.vertex_scene)
         step = scene.step_input(window.start_frame + max(slot.age - 1, 0), slot.state, relaxing=first)
         if first and slot.still:
             step = replace(step, dt=torch.full_like(step.dt, scene.dt))
@@ -210,11 +209,14 @@ class Slots:
             parts.append(slot.window.scene.skinned_acceleration(slot.window.start_frame + max(slot.age - 1, 0)))
         return torch.cat(parts)
 
-    def advance(self, next_pos: Tensor, next_vel: Tensor, lost: Sequence[bool] | None = None) -> None:
+    def advance(
+        self, next_pos: Tensor, next_vel: Tensor, lost: Sequence[bool] | None = None, centres: Tensor | None = None
+    ) -> None:
         """Take the predicted positions (V, 3) and velocities (V, 3) over; rollouts that are lost end here.
 
         Args:
             lost: what :func:`is_lost` says of the positions, where that is known.
+            centres: (B, 3) m, on the CPU: :func:`hood.cloth.state.centres_of` the positions, where they are known.
 
         The turn passes on to the next bucket.
         """
@@ -228,7 +230,8 @@ class Slots:
             pos, vel, cloth = next_pos[rows].detach(), next_vel[rows].detach(), slot.window.scene.cloth
             if slot.age == 0:
                 vel = self._relaxed(slot, vel)
-            slot.state = State(pos, vel, slot.state.origin)
+            centre = None if centres is None else centres[place : place + 1]
+            slot.state = recentre(State(pos, vel, slot.state.origin), cloth.vertex_scene, centre)
             slot.age += 1
             if is_lost(cloth, pos, self.ending_strain) if lost is None else lost[place]:
                 slot.window = None
@@ -285,7 +288,8 @@ class Slots:
         slot.length, slot.still = horizon if self.whole else None, slot.window.still and horizon == 0
         # The way of the frame before, as a velocity in the time of the first step.
         vel = start.state.vel if self._in_frames(slot) else start.state.vel * (slot.window.scene.dt / RELAXING_DT)
-        slot.state = State(start.state.pos.to(device), vel.to(device), start.state.origin)
+        begin = recentre(State(start.state.pos, vel, start.state.origin), torch.zeros(len(vel), dtype=torch.int64))
+        slot.state = State(begin.pos.to(device), begin.vel.to(device), begin.origin)
         slot.draws += start.draws
         slot.prepared = self._prepare(slot.window)
         slot.age = 0

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import say
@@ -197,19 +199,21 @@ class Trainer:
         potential = settings.collision.apply(self.potential, count)
         simulator.use_potential(for_networks(potential))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
-        self.optimizer.zero_grad(set_to_none=True)
-        with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
-            update = self._take(potential, settings.horizon.after_relaxing(count), collecting)
-        if not collecting and update.backward is not None:
-            with timed(self.stopwatch, "backward"):
-                update.backward()
-        means, lost = update.read()
+        while True:
+            self.optimizer.zero_grad(set_to_none=True)
+            with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
+                update = self._take(potential, settings.horizon.after_relaxing(count), collecting)
+            norm = None if collecting else self._answer(update)
+            figures = update.read(norm)
+            if update.holds(figures):
+                break
+        means = figures.measured
         energies = {name: means[name] for name in update.energies}
         report = {**energies, "total": sum(energies.values()), **means, "horizon": float(settings.horizon(count))}
-        if not collecting:
-            report |= self._optimise(energies)
+        if norm is not None:
+            report |= self._optimise(energies, norm, figures.norm)
         with timed(self.stopwatch, "scenes"):
-            self.slots.advance(update.next_pos, update.next_vel, lost)
+            self.slots.advance(update.next_pos, update.next_vel, figures.lost, figures.centres)
         self.iteration += 1
         return report
 
@@ -400,15 +404,23 @@ class Trainer:
             header = {"iteration": self._iterations_in_all, "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
 
-    def _optimise(self, energies: Mapping[str, float]) -> dict[str, float]:
+    def _answer(self, update: Update) -> Tensor:
+        """The norm () of the update's gradients before it is shortened, which also tells infinite ones."""
+        if update.backward is not None:
+            with timed(self.stopwatch, "backward"):
+                update.backward()
+        with timed(self.stopwatch, "optimiser"):
+            self.whitening.pull()
+            return get_total_norm([value.grad for value in self.simulator.parameters() if value.grad is not None])
+
+    def _optimise(self, energies: Mapping[str, float], total: Tensor, norm: float) -> dict[str, float]:
+        """One step of the optimiser, if energies and the gradients' norm are finite; ``total`` () is it on the device."""
         settings, finite = self.settings, math.isfinite(sum(energies.values()))
         factor = settings.schedule(self.iteration, settings.iterations)
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * factor
         with timed(self.stopwatch, "optimiser"):
-            self.whitening.pull()
-            # The norm before it is shortened, which also tells infinite gradients.
-            norm = float(torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), settings.clip_norm))
+            clip_grads_with_norm_(self.simulator.parameters(), settings.clip_norm, total)
             if distributed.any_rank(not (finite and math.isfinite(norm))):
                 self._skips.skip(self.iteration + 1, energies, norm)
             else:

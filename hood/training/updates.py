@@ -3,22 +3,20 @@ function of fixed shapes."""
 
 from __future__ import annotations
 
-import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from hood.cloth.cloth import Cloth
-from hood.energies.contact import Collision
-from hood.energies.friction import Friction
+from hood.cloth.state import centres_of
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
-from hood.energies.term import Term, named
 from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.static_shapes import Capacity, StaticLayout, lay_out
@@ -30,13 +28,23 @@ from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, 
 from hood.steppers.static_shapes.problem import altered, problem_from, settled_potential, step_inputs, step_shape
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
 from hood.tensors.precision import products
-from hood.training.curriculum import CollisionRamp, weighted_terms
+from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
 from hood.training.log import output_spread
 from hood.training.settings import Signal, TrainerSettings
 from hood.training.slots import TrainingStep, is_lost
 
 #: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
 Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
+
+
+class Figures(NamedTuple):
+    """What the host is told of an update."""
+
+    measured: dict[str, float]  # means of the energies, then what :data:`MEASURED` says
+    lost: list[bool]  # by scene: rollouts that end here
+    centres: Tensor  # (B, 3) m: means of the vertices of a scene where it leads
+    norm: float  # of the gradients; NaN: none were given
+    num_found: list[tuple[int, int, int]]  # by scene, see :class:`hood.steppers.static_shapes.simulator.StepResult`
 
 
 @dataclass(frozen=True)
@@ -47,14 +55,20 @@ class Update:
     next_vel: Tensor  # (V, 3) m/s
     measured: Tensor  # (M,) means of the energies in the order of ``energies``, then what :data:`MEASURED` says
     energies: tuple[str, ...]
-    lost: Tensor  # (B,) bool: rollouts that end here
+    told: Tensor  # (B, 4) :func:`outcome_of`, or (B, 7) with what was found
     backward: Callable[[], None] | None = None  # computes the gradients, where that is not done
+    holds: Callable[[Figures], bool] = lambda figures: True  # False: there was no room; the update is to be taken again
 
-    def read(self) -> tuple[dict[str, float], list[bool]]:
-        """``measured`` by name, and ``lost``; waits for the device, once."""
-        values = torch.cat([self.measured, self.lost.to(self.measured)]).tolist()
+    def read(self, norm: Tensor | None = None) -> Figures:
+        """The figures, with the ``norm`` () of the gradients; waits for the device, once."""
+        measured = self.measured if norm is None else torch.cat([norm.reshape(1).to(self.measured), self.measured])
+        values = torch.cat([measured, self.told.to(measured).flatten()]).tolist()
+        first = values.pop(0) if norm is not None else math.nan
         names = (*self.energies, *MEASURED)
-        return dict(zip(names, values, strict=False)), [value > 0 for value in values[len(names) :]]
+        told = torch.tensor(values[len(names) :]).reshape(self.told.shape)
+        found = [cast(tuple[int, int, int], tuple(map(int, row))) for row in told[:, 4:].tolist()]
+        lost = [value > 0 for value in told[:, 0].tolist()]
+        return Figures(dict(zip(names, values, strict=False)), lost, told[:, 1:4], first, found)
 
 
 #: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
@@ -75,6 +89,12 @@ def figures_of(
     means = [value.mean() for value in energies.values()]
     loss = signal.loss(problem, energies, acc, residual).mean()
     return torch.stack([*means, loss, residual.median(), output_spread(output, problem.cloth.free).to(loss)])
+
+
+def outcome_of(cloth: Cloth, next_pos: Tensor, torn_strain: float) -> Tensor:
+    """(B, 4): whether a rollout ends here (:func:`hood.training.slots.is_lost`), and the centre of its cloth [m]."""
+    lost = is_lost(cloth, next_pos, torn_strain)
+    return torch.cat([lost.to(next_pos).unsqueeze(1), centres_of(next_pos, cloth.vertex_scene, len(lost))], dim=1)
 
 
 def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
@@ -137,7 +157,7 @@ def plain_update(
         simulator.next_velocity(shown, prediction).detach(),
         figures_of(problem, energies, acc, prediction.acc.detach(), residual, signal),
         tuple(energies),
-        is_lost(cloth, next_pos, torn_strain),
+        outcome_of(cloth, next_pos, torn_strain),
         backward,
     )
 
@@ -163,6 +183,9 @@ class CapturedUpdates:
     def __init__(self, simulator: NetworkStepper, signal: Signal, torn_strain: float, mode: str) -> None:
         self.simulator, self.signal, self.torn_strain, self.mode = simulator, signal, torn_strain, mode
         self._plans: dict[Any, _Plan] = {}
+        self._capacities: dict[Any, Capacity] = {}
+        self._statistics = list(_statistics(simulator).values())
+        self._before = [value.clone() for value in self._statistics]
 
     def __call__(self, parts: Sequence[TrainingStep], potential: Potential) -> Update:
         """One update of the scenes, one after the other; the gradients of their mean are with the parameters.
@@ -173,33 +196,46 @@ class CapturedUpdates:
         Raises:
             ValueError: a scene or the potential has no form of fixed shapes; the message says what to use.
         """
-        outcomes = [self._take(part, potential, len(parts) == 1) for part in parts]
+        if self._statistics:
+            torch._foreach_copy_(self._before, self._statistics)
+        asked = [self._made_ready(part, potential) for part in parts]
+        outcomes = [plan.take(problem, potential, len(parts) == 1) for plan, problem in asked]
         for parameter, *given in zip(self.simulator.parameters(), *(outcome.gradients for outcome in outcomes), strict=True):
             parameter.grad = given[0] if len(given) == 1 else torch.stack(given).mean(dim=0)
+        count = len(outcomes[0].energies) + len(MEASURED)
+        told = torch.stack([outcome.numbers[count:] for outcome in outcomes])
+
+        def holds(figures: Figures) -> bool:
+            """Room is made where there was none, and the statistics are those of before."""
+            found: dict[_Plan, tuple[int, int, int]] = {}
+            for (plan, _), counts in zip(asked, figures.num_found, strict=True):
+                found[plan] = cast(tuple[int, int, int], tuple(map(max, counts, found.get(plan, counts))))
+            short = [plan for plan, counts in found.items() if not plan.layout.capacity.holds(counts)]
+            for plan in short:
+                self._capacities[plan.key] = more_capacity(found[plan], plan.like)
+                self._plans.pop(plan.key)  # its memory is free before there is another
+            if short and self._statistics:
+                torch._foreach_copy_(self._statistics, self._before)
+            return not short
+
         return Update(
             torch.cat([outcome.next_pos for outcome in outcomes]),
             torch.cat([outcome.next_vel for outcome in outcomes]),
-            torch.stack([outcome.measured for outcome in outcomes]).mean(dim=0),
+            torch.stack([outcome.numbers[:count] for outcome in outcomes]).mean(dim=0),
             outcomes[0].energies,
-            torch.cat([outcome.lost for outcome in outcomes]),
+            told,
+            holds=holds,
         )
 
-    def _take(self, part: TrainingStep, potential: Potential, alone: bool) -> _Outcome:
+    def _made_ready(self, part: TrainingStep, potential: Potential) -> tuple[_Plan, StepProblem]:
         problem = StepProblem(part.cloth, part.state, part.step, gravity=self.simulator.gravity)
         if problem.num_scenes > 1 or problem.step.attachments is not None:
             raise ValueError("scenes with fasteners have no update of fixed shapes: use trainer.step=plain")
         key = (part.kind, _shape(problem))
-        plan = self._plans.get(key)
-        capacity = first_capacity(self.simulator, problem) if plan is None else plan.layout.capacity
-        while True:
-            if plan is None or plan.layout.capacity != capacity:
-                self._plans.pop(key, None)  # its memory is free before there is another
-                plan = self._plans[key] = _Plan(self, problem, part.prepared, potential, capacity)
-            outcome = plan.take(problem, potential, alone)
-            if capacity.holds(outcome.num_found):
-                plan.keep_statistics()
-                return outcome
-            capacity = more_capacity(outcome.num_found, problem)
+        if key not in self._plans:
+            capacity = self._capacities.get(key) or first_capacity(self.simulator, problem)
+            self._plans[key] = _Plan(self, key, problem, part.prepared, potential, capacity)
+        return self._plans[key], problem
 
     @property
     def pool(self) -> Any:
@@ -211,10 +247,8 @@ class CapturedUpdates:
 class _Outcome:
     next_pos: Tensor
     next_vel: Tensor
-    measured: Tensor  # on the host, as ``lost``
+    numbers: Tensor
     energies: tuple[str, ...]
-    lost: Tensor
-    num_found: tuple[int, int, int]
     gradients: tuple[Tensor, ...]
 
 
@@ -222,10 +256,16 @@ class _Plan:
     """The update made ready for scenes of one shape."""
 
     def __init__(
-        self, owner: CapturedUpdates, problem: StepProblem, prepared: Prepared, potential: Potential, capacity: Capacity
+        self,
+        owner: CapturedUpdates,
+        key: Any,
+        problem: StepProblem,
+        prepared: Prepared,
+        potential: Potential,
+        capacity: Capacity,
     ) -> None:
         assert prepared.static is not None
-        simulator = owner.simulator
+        simulator, self.key, self.like = owner.simulator, key, problem
         self.layout: StaticLayout = lay_out(prepared.static, capacity, None)
         self._simulator = simulator
         self._inputs = InputMemory(self._read(problem, potential))
@@ -245,33 +285,27 @@ class _Plan:
         """The update; ``alone``: its gradients are used before the next one is computed."""
         self._inputs.load(self._read(problem, potential))
         with products(self._simulator.network.precision):
-            next_pos, next_vel, measured, *rest = self._run(*self._memory)
-        gradients, self._counted = rest[: self._num_parameters], rest[self._num_parameters :]
-        edges, vertices, faces, lost, *means = measured.tolist()
+            next_pos, next_vel, numbers, *rest = self._run(*self._memory)
+        gradients = rest[: self._num_parameters]
+        if self._statistics:
+            torch._foreach_copy_(self._statistics, rest[self._num_parameters :])
         return _Outcome(
             next_pos.clone(),  # the next update writes to the same memory
             next_vel.clone(),
-            measured.new_tensor(means, device="cpu"),
+            numbers if alone else numbers.clone(),
             self._energies,
-            torch.tensor([lost > 0]),
-            (int(edges), int(vertices), int(faces)),
             tuple(gradients) if alone else tuple(gradient.clone() for gradient in gradients),
         )
 
-    def keep_statistics(self) -> None:
-        """What was counted in the last update counts from now on."""
-        for known, counted in zip(self._statistics, self._counted, strict=True):
-            known.copy_(counted)
-
     def _read(self, problem: StepProblem, potential: Potential) -> list[Tensor]:
-        weight = problem.state.pos.new_full((), _contact_weight(potential))
+        weight = problem.state.pos.new_full((), contact_weight(potential))
         return [weight, *_values(problem.cloth).values(), *step_inputs(problem, surface=True)]
 
 
 class _Function:
     """``next_pos, next_vel, numbers, *gradients, *statistics = function(*inputs)``.
 
-    ``numbers`` are body edges, active body vertices and faces found, whether the rollout is lost, and what is measured.
+    ``numbers`` are :attr:`Update.measured`, then a row of :attr:`Update.told`.
     """
 
     def __init__(self, owner: CapturedUpdates, layout: StaticLayout, like: StepProblem, potential: Potential) -> None:
@@ -302,7 +336,7 @@ class _Function:
         names, owner = self._values, self._owner
         cloth = _with_values(self._like.cloth, dict(zip(names, values[: len(names)], strict=True)))
         problem, incidence = problem_from(altered(self._like, cloth=cloth), values[len(names) :])
-        potential = self._potential if self._looks else _weighing(self._potential, weight)
+        potential = self._potential if self._looks else with_weight_on_device(self._potential, weight)
         shown = for_networks(potential) if self._looks else None
         dense = owner.mode != "fixed"
         problem, seen, graph, num_found = see(simulator, self._layout, problem, incidence, potential, dense)
@@ -315,8 +349,8 @@ class _Function:
         residual = relative_gradient(problem, gradient)
         surrogate = surrogate_of(problem, prediction, gradient, residual, owner.signal)
         measured = figures_of(problem, energies, acc, acc, residual, owner.signal)
-        lost = is_lost(cloth, next_pos, owner.torn_strain)
-        numbers = torch.cat([num_found.to(measured), lost.to(measured), measured])
+        (outcome,) = outcome_of(cloth, next_pos, owner.torn_strain)
+        numbers = torch.cat([measured, outcome.to(measured), num_found.to(measured)])
         return surrogate, (next_pos, simulator.next_velocity(problem, prediction).detach(), numbers)
 
 
@@ -399,25 +433,3 @@ def _with_values(like: Cloth, values: Mapping[str, Tensor]) -> Cloth:
 def _shape(problem: StepProblem) -> tuple[Any, ...]:
     values = _values(problem.cloth)
     return (*step_shape(problem, surface=True), tuple(values), tuple(value.shape for value in values.values()))
-
-
-def _contact_weight(potential: Potential) -> float:
-    return float(next((getattr(term, "weight", 0.0) for term in weighted_terms(potential).values()), 0.0))
-
-
-def _weighing(potential: Potential, weight: Tensor) -> Potential:
-    """The potential with a weight of contact that is read on the device."""
-    changed: dict[str, Term] = {}
-    for name, term in weighted_terms(potential).items():
-        if term.with_weight(0.0) is term:
-            continue
-        if type(term).with_weight not in _PLAINLY_WEIGHTED:
-            raise ValueError(
-                f"{named(name, cast(Term, term))} has no weight that a recorded update could change: use trainer.step=plain"
-            )
-        changed[name] = cast(Term, copy.copy(term))
-        changed[name].weight = weight  # type: ignore[attr-defined]
-    return potential.only({**potential.terms, **changed})
-
-
-_PLAINLY_WEIGHTED = (Collision.with_weight, Friction.with_weight)

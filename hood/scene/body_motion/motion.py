@@ -178,9 +178,11 @@ class BodyMotion:
         if known is not None and known[0] == key:
             return known[1]
         _forget(self._placed, frame, 2)
-        shift = torch.as_tensor(self.translation[frame] - origin).to(self.device)
+        local = self.local_surface(frame)
+        # Filled, not copied: nothing waits for a device.
+        shift = torch.stack([local.new_full((), value) for value in self.translation[frame] - origin])
         # Rounded once, at the end: a mesh that moves as this body does gives the same numbers.
-        surface = (self.local_surface(frame) + shift).to(self.dtype)
+        surface = (local + shift).to(self.dtype)
         self._placed[frame] = key, surface
         return surface
 
