@@ -159,6 +159,7 @@ def counted(trainer: Trainer) -> Iterator[Parts]:
         (simulator.network, "forward", "network", True),
         (Potential, "gradient", "energies", False),
         (Tensor, "backward", "backward", True),
+        (trainer, "_answer", "optimiser", True),
         (trainer, "_optimise", "optimiser", True),
     ]
     originals = [(owner, name, getattr(owner, name), name in vars(owner)) for owner, name, _, _ in watched]

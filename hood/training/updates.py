@@ -61,14 +61,17 @@ class Update:
 
     def read(self, norm: Tensor | None = None) -> Figures:
         """The figures, with the ``norm`` () of the gradients; waits for the device, once."""
-        measured = self.measured if norm is None else torch.cat([norm.reshape(1).to(self.measured), self.measured])
-        values = torch.cat([measured, self.told.to(measured).flatten()]).tolist()
-        first = values.pop(0) if norm is not None else math.nan
-        names = (*self.energies, *MEASURED)
-        told = torch.tensor(values[len(names) :]).reshape(self.told.shape)
+        given = [self.told.flatten(), self.measured, *([] if norm is None else [norm.reshape(1)])]
+        values, count = torch.cat([value.to(self.measured) for value in given]).cpu(), self.told.numel()
+        told, measured = values[:count].reshape(self.told.shape), values[count:].tolist()
         found = [cast(tuple[int, int, int], tuple(map(int, row))) for row in told[:, 4:].tolist()]
-        lost = [value > 0 for value in told[:, 0].tolist()]
-        return Figures(dict(zip(names, values, strict=False)), lost, told[:, 1:4], first, found)
+        return Figures(
+            dict(zip((*self.energies, *MEASURED), measured, strict=False)),
+            (told[:, 0] > 0).tolist(),
+            told[:, 1:4],
+            math.nan if norm is None else measured[-1],
+            found,
+        )
 
 
 #: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
@@ -213,7 +216,9 @@ class CapturedUpdates:
             short = [plan for plan, counts in found.items() if not plan.layout.capacity.holds(counts)]
             for plan in short:
                 self._capacities[plan.key] = more_capacity(found[plan], plan.like)
-                self._plans.pop(plan.key)  # its memory is free before there is another
+                self._plans.pop(plan.key)
+            if short:
+                asked.clear()  # memory of plans is free before there are others
             if short and self._statistics:
                 torch._foreach_copy_(self._statistics, self._before)
             return not short
@@ -247,7 +252,7 @@ class CapturedUpdates:
 class _Outcome:
     next_pos: Tensor
     next_vel: Tensor
-    numbers: Tensor
+    numbers: Tensor  # (M + 7,): Update.measured, then a row of Update.told
     energies: tuple[str, ...]
     gradients: tuple[Tensor, ...]
 
