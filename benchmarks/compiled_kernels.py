@@ -8,7 +8,8 @@ The compiler's scheduler decides on a CPU what is one kernel, and nothing is gen
 but for concatenations: it makes one kernel of up to eight arrays, and so does it here. Printed are the operations of the traced
 frame, the kernels by kind, their sum, the bytes that they read and write, and the time of an H100 by these counts
 (benchmarks/roofline.py). Operators of our own count as the kernels that they have; arrays whose rows they gather are read once,
-from then on they are in the cache, and all of their matrices meet as many rows as their largest array has.
+from then on they are in the cache, and all of their matrices meet as many rows as their largest array has. Of arrays that the
+edge sets of a step share, a set's kernels read and write the columns, and the rows, that are theirs.
 """
 
 from __future__ import annotations
@@ -26,19 +27,21 @@ from roofline import DATA_SHEETS
 
 from hood.assets.files.library import locate
 from hood.model.graph.static_shapes import lay_out
+from hood.model.kernels.triton_step import tile_of
 from hood.solver.system.iterate import in_double
 from hood.solver.system.plan import plan_for
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.static_shapes.cuda_graph import count_operations, trace
 from hood.steppers.static_shapes.newton_pieces import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
-from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
+from hood.steppers.static_shapes.simulator import FixedStep, first_capacity
 from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import assumed
 
 #: Kernels of an operator that has not one, and how often they read and write what the operator is given.
 STEPS = frame_settings().cg_iterations
-KERNELS = {"torch.ops.hood.step_edges.default": (2, 1), "torch.ops.hood.block_cg.default": (1 + 2 * STEPS, STEPS)}
+STEP_EDGES = "torch.ops.hood.step_edges.default"
+KERNELS = {STEP_EDGES: (2, 1), "torch.ops.hood.block_cg.default": (1 + 2 * STEPS, STEPS)}
 #: Operations on a pair of a point and a vertex in the search for the nearest ones.
 PAIR = 20
 #: No matrix of a network has more rows or columns.
@@ -72,7 +75,7 @@ class Frame:
         if name in NOTHING:
             return
         number, times = KERNELS.get(name, (1, 1))
-        moved = int(node.get_read_write_buffers_sizes()) * times
+        moved = edges_of_a_step(node.node) if name == STEP_EDGES else int(node.get_read_write_buffers_sizes()) * times
         own = name.startswith("torch.ops.hood.") and times == 1
         work, rate = matrices(node.node) if own else int(node.estimate_flops() or 0), device.matmul[self.precision]
         if name == "torch.ops.hood.nearest_three.default":
@@ -87,6 +90,17 @@ def matrices(operator: Any) -> int:
     shapes = [tuple(int(size) for size in given.get_size()) for given in operator.inputs]
     weights = sum(math.prod(shape) for shape in shapes if len(shape) == 2 and max(shape) <= WIDEST)
     return 2 * max(shape[0] for shape in shapes if shape) * weights
+
+
+def edges_of_a_step(operator: Any) -> int:
+    """Bytes of :func:`hood.model.kernels.triton_step.step_edges`."""
+    latent, tables, received, receivers, *others = operator.inputs
+    one, (_, width) = latent.get_dtype().itemsize, latent.get_size()
+    (edges,), (nodes, _) = receivers.get_size(), tables.get_size()
+    assert list(received.get_size()) == [nodes, width]
+    values = 2 * edges * width + 2 * nodes * width + nodes * width  # latents in and out, two columns of the tables, the sums
+    borders = 2 * 2 * -(-edges // tile_of(width, latent.get_dtype())) * width * torch.float32.itemsize  # written and read
+    return int(borders + one * values + sum(math.prod(x.get_size()) * x.get_dtype().itemsize for x in (receivers, *others)))
 
 
 def pairs(search: Any) -> int:
@@ -161,7 +175,7 @@ def network_frame(bench: Bench, model: str, precision: str) -> tuple[Any, list[t
     static = simulator.prepare(problem.cloth, bench.scene.garment.rest_pos).static
     assert static is not None
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
-    layout = lay_out(static, CapturedSimulator(simulator, "fixed")._first_capacity(problem))
+    layout = lay_out(static, first_capacity(simulator, problem))
     inputs = step_inputs(problem, simulator.needs_contact)
     return FixedStep(simulator, layout, problem, dense=True, potential=potential), inputs
 

@@ -66,7 +66,7 @@ from hood.steppers.newton import NewtonStepper, Stepper
 from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
-from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep
+from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep, first_capacity
 from hood.tensors.dense import whole_arrays
 from hood.tensors.precision import has_triton
 from hood.testing import without_values
@@ -193,7 +193,7 @@ def network_work(simulator: NetworkStepper, bench: Bench) -> Work:
     simulator.network.use_precision("bf16" if simulator.network.precision == "bf16" else "fp32")
     static = simulator.prepare(problem.cloth, bench.scene.garment.rest_pos).static
     assert static is not None
-    capacity = CapturedSimulator(simulator, "fixed")._first_capacity(problem)
+    capacity = first_capacity(simulator, problem)
     potential = settled_potential(simulator.potential, problem) if simulator.looks_at_potential else None
     inputs, layout = step_inputs(problem, simulator.needs_contact), lay_out(static, capacity)
     with FakeTensorMode():

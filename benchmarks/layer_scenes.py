@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the tests' own scenes
-from layer_scenes import SCENES
+from layer_scenes import SCENES  # type: ignore[attr-defined]  # mypy knows the other module of that name only
 
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem

@@ -16,7 +16,7 @@ from hood.energies.problem import StepProblem
 from hood.model.graph.known_hierarchies import given_hierarchy
 from hood.scene.scene import RELAXING_DT, Scene
 from hood.solver.derivatives.self_contact import approached, layers_of
-from hood.solver.newton import NewtonSettings, first_guess, minimize, plan_ahead
+from hood.solver.newton import NewtonSettings, Report, first_guess, minimize, plan_ahead
 from hood.solver.step_figures import reason_number
 from hood.solver.system.iterate import Progress, in_single, rounded
 from hood.solver.system.plan import plan_for
@@ -86,6 +86,8 @@ class RefinedStepper:
         goal: how far. What it learns belongs to a rollout, which begins with a fresh copy.
         method: ``newton``, a few global iterations, or ``sweeps`` of single vertices, which smooth at short range.
         settings: of Newton's linear systems; its accuracy and iterations are the goal's affair.
+        minimizer: takes Newton's iterations in place of :func:`hood.solver.newton.minimize`, and searches for contact itself,
+            such as :class:`hood.steppers.static_shapes.newton.FixedMinimizer`.
     """
 
     def __init__(
@@ -95,11 +97,12 @@ class RefinedStepper:
         goal: StoppingCriterion,
         method: str = "newton",
         settings: NewtonSettings | None = None,
+        minimizer: Callable[..., tuple[Tensor, Report]] | None = None,
     ) -> None:
         if method not in METHODS:
             raise ValueError(f"method is {method!r}; choose {' or '.join(METHODS)}")
         self.inner, self.potential, self.goal, self.method = inner, potential, goal, method
-        self._fresh_goal = deepcopy(goal)
+        self._fresh_goal, self._minimizer = deepcopy(goal), minimizer
         self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)
         self.gravity = inner.gravity
         # The guess can be made in any precision, a network computes in that of its weights.
@@ -133,7 +136,8 @@ class RefinedStepper:
 
     def search(self, problem: StepProblem) -> StepProblem:
         """The problem with what the inner stepper and the potential's terms ask of it."""
-        return self.potential.prepare(self.inner.search(problem))
+        problem = self.inner.search(problem)
+        return problem if self._minimizer is not None else self.potential.prepare(problem)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1, by the inner stepper's rule."""
@@ -152,7 +156,7 @@ class RefinedStepper:
             # Made once per cloth, so here: no part of what an iteration costs.
             if self.method == "sweeps":
                 colours_of(plan_for(problem), problem.cloth, problem.step.attachments)
-            else:
+            elif self._minimizer is None:
                 plan_ahead(self.potential, problem, self.settings)
             # A relaxing step is no frame and keeps no time: the refinement alone counts for its goal.
             return self._refine(problem, prediction, (Stopwatch() if watch is None else watch).elapsed)
@@ -212,7 +216,8 @@ class RefinedStepper:
         start = prediction.next_pos
         if self.method == "newton":
             asked = proceed if self.goal.decides else None
-            pos, report = minimize(self.potential, problem, start, self.settings, proceed=asked)
+            solve = self._minimizer or minimize
+            pos, report = solve(self.potential, problem, start, self.settings, proceed=asked)
             acc, history, reason = report.acc, report.history, reason_number(report.reason)
         else:
             wants = self.goal.wants_residual

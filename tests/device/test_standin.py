@@ -27,6 +27,7 @@ FAST = {
     "network captured by itself": (1e-5, 1405, 6490),
     "solver captured": (1e-6, 442, 3145),
     "refined": (1e-6, 1880, 0),
+    "refined captured": (1e-6, 1025, 9630),
     "outfit": (1e-6, 1580, 0),
 }
 SLOW = {

@@ -40,6 +40,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "solver": ("garment=tshirt", *SOLVER),
     "solver captured": ("garment=tshirt", *SOLVER, *PLAIN, "step=captured"),
     "refined": ("garment=tshirt", "checkpoint=quickstart", "refine=2"),
+    "refined captured": ("garment=tshirt", "checkpoint=quickstart", "refine=2", "kernels=torch", *PLAIN, "step=captured"),
     "outfit": ("garment=[tank,skirt]", "sequence=plie", *SOLVER, "num_frames=3"),
     "fasteners": ("garment=jacket", *SOLVER, "events=[{frame: 1, open: front_zip}]", "num_frames=3"),
 }

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from hood.app.settings.compose import ConfigError, brief, build, require_choice
-from hood.app.settings.rollout_settings import Refinement, RolloutSettings, measurement, refinement
+from hood.app.settings.rollout_settings import Refinement, RolloutSettings, fixed_shapes, measurement, refinement
 from hood.app.stepping.steppers import ALWAYS, NEVER, losses_of, option_of
 from hood.assets.files.library import unknown
 from hood.energies.potential import Potential
@@ -20,6 +21,7 @@ from hood.rollouts.frame import FIELD_CHOICES
 from hood.solver.step_figures import count_reasons, name_counts
 from hood.steppers.newton import Stepper
 from hood.steppers.refined import METHODS, RefinedStepper
+from hood.steppers.static_shapes.newton import minimizer_for
 from hood.steppers.stopping import (
     Budget,
     Count,
@@ -150,7 +152,10 @@ def refined(stepper: Stepper, config: RolloutSettings, num_vertices: int, potent
     if goal is None:
         return stepper
     potential = losses_of(config) if potential is None else potential
-    return RefinedStepper(stepper, potential, goal, refinement(config).method, build(config.solver))
+    method, settings = refinement(config).method, build(config.solver)
+    fixed = method == "newton" and fixed_shapes(config)
+    minimizer = minimizer_for(str(config.step), settings, torch.device(str(config.device))) if fixed else None
+    return RefinedStepper(stepper, potential, goal, method, settings, minimizer)
 
 
 def summarise_refinement(config: Mapping[str, Any], metrics: Mapping[str, np.ndarray]) -> dict[str, Any]:

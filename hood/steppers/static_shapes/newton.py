@@ -5,18 +5,19 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from hood.cloth.cloth import Cloth
-from hood.energies.potential import keeps_both_sides
+from hood.energies.potential import Potential, keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.vertices import terms_without_form
-from hood.solver.newton import Report, reason_of, run
+from hood.solver.newton import NewtonSettings, Report, reason_of, run
 from hood.solver.step_figures import MOST_ITERATIONS, reason_number
-from hood.solver.system.iterate import rounded
+from hood.solver.system.iterate import Proceed, rounded
 from hood.solver.system.plan import plan_for
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
@@ -62,9 +63,8 @@ class CapturedNewton:
             raise ValueError(f"step={mode} is none of the solver's; choose plain, {' or '.join(_MODES)}")
         if mode == "captured" and not has_graphs(stepper.gravity.device):
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
-        if stepper.settings.linear != "cg":
-            raise ValueError(f"solver.linear={stepper.settings.linear} has no form of fixed shapes; use cg or step=plain")
         settings = stepper.settings
+        check_settings(settings)
         if mode == "compiled" and (settings.max_iterations > MOST or settings.cg_iterations > MOST_CG):
             raise ValueError(
                 f"step=compiled takes all of solver.max_iterations={settings.max_iterations} and cg_iterations="
@@ -77,7 +77,7 @@ class CapturedNewton:
         self.stepper, self.mode = stepper, mode
         self.gravity, self.config, self.metrics = stepper.gravity, stepper.config, stepper.metrics
         self.solves_to = stepper.solves_to
-        self._plan: _Plan | _Frame | None = None
+        self._minimize = FixedMinimizer(mode)
 
     def prepare(self, cloth: Cloth, rest_pos: Any) -> None:
         """Nothing: what is known of a cloth is kept with the step."""
@@ -89,42 +89,87 @@ class CapturedNewton:
     @torch.no_grad()
     def predict(self, problem: StepProblem, prepared: None, watch: Stopwatch | None = None) -> Prediction:
         """The minimum next to the contact-projected inertial guess."""
-        began = time.perf_counter()
         with timed(watch, "solver"):
-            plan = self._plan
-            if plan is None or plan.is_stale(problem):
-                plan = self._make_plan(problem, 0)
-            while (faces := plan.enter(problem)) > plan.places:
-                plan = self._make_plan(problem, faces)
-            pos, report = plan.minimize(problem, began)
+            pos, report = self._minimize(self.stepper.potential, problem, settings=self.stepper.settings)
         reached = {
             "solver_iterations": float(report.iterations),
             "solver_converged": float(bool(report.converged.all())),
             "solver_reason": reason_number(report.reason),
         }
-        return Prediction(pos, report.acc.to(pos.dtype), reached, float(report.relative_gradient.max()))
+        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()))
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
         return self.stepper.next_velocity(problem, prediction)
 
-    def _make_plan(self, problem: StepProblem, places: int) -> _Plan | _Frame:
-        self._plan = None  # its memory is free before there is another
-        if self.mode == "compiled":
-            self._plan = _Frame(self.stepper, problem, places)
-        else:
-            self._plan = _Plan(self.stepper, problem, places, self.mode == "captured")
-        return self._plan
+
+def check_settings(settings: NewtonSettings) -> None:
+    """Raise ValueError where they have no form of fixed shapes."""
+    if settings.linear != "cg":
+        raise ValueError(f"solver.linear={settings.linear} has no form of fixed shapes; use cg or step=plain")
+
+
+class FixedMinimizer:
+    """:func:`hood.solver.newton.minimize` in pieces of fixed shapes, the search for contact included.
+
+    What is made for a problem is kept, and made anew for one of other shapes, another cloth, potential or settings.
+
+    Args:
+        mode: as :class:`CapturedNewton` has it; a compiled function starts from the inertial guess and asks nobody.
+    """
+
+    def __init__(self, mode: str) -> None:
+        self.mode = mode
+        self._plan: _Plan | _Frame | None = None
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        potential: Potential,
+        problem: StepProblem,
+        start: Tensor | None = None,
+        settings: NewtonSettings | None = None,
+        *,
+        proceed: Proceed | None = None,
+    ) -> tuple[Tensor, Report]:
+        """As :func:`hood.solver.newton.minimize`.
+
+        Raises:
+            ValueError: the potential has no such form.
+        """
+        began, settings, places = time.perf_counter(), settings or NewtonSettings(), 0
+        plan = self._plan
+        if plan is not None and plan.is_stale(problem, potential, settings):
+            plan = None
+        while plan is None or (places := plan.enter(problem)) > plan.places:
+            self._plan = plan = None  # its memory is free before there is another
+            given = potential, settings, problem, places
+            self._plan = plan = _Frame(*given) if self.mode == "compiled" else _Plan(*given, self.mode == "captured")
+        pos, report = plan.minimize(problem, began, start, proceed)
+        return pos, replace(report, acc=report.acc.to(pos.dtype))
+
+
+def minimizer_for(mode: str, settings: NewtonSettings, device: torch.device) -> FixedMinimizer | None:
+    """What takes iterations after a network whose steps are taken in ``mode``; None: nothing of fixed shapes. A compiled
+    function holds the network's step alone, and the iterations after it are graphs where there are any.
+
+    Raises:
+        ValueError: settings that have no such form.
+    """
+    check_settings(settings)
+    if mode == "compiled":
+        return FixedMinimizer("captured") if has_graphs(device) else None
+    return FixedMinimizer(mode)
 
 
 class _Fixed:
     """What is known of problems of one shape, and the memory of their inputs."""
 
-    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int) -> None:
-        self.places, self._stepper, self._like = places, stepper, problem
-        self._constants, self._shape = Constants(problem, stepper.potential), step_shape(problem, surface=True)
+    def __init__(self, potential: Potential, settings: NewtonSettings, problem: StepProblem, places: int) -> None:
+        self.places, self._settings, self._like = places, settings, problem
+        self._constants, self._shape = Constants(problem, potential), step_shape(problem, surface=True)
         self._inputs = InputMemory(step_inputs(problem, surface=True))
-        self._potential, self._known = settled_potential(stepper.potential, problem), problem.with_fold()
+        self._potential, self._known = settled_potential(potential, problem), problem.with_fold()
         others = terms_without_form(self._potential, self._known)
         if others is not None:
             raise ValueError(
@@ -132,18 +177,18 @@ class _Fixed:
                 "shapes need: use step=plain"
             )
 
-    def is_stale(self, problem: StepProblem) -> bool:
+    def is_stale(self, problem: StepProblem, potential: Potential, settings: NewtonSettings) -> bool:
         """Whether a problem needs another plan."""
-        same = step_shape(problem, surface=True) == self._shape
-        return not same or not self._constants.hold(problem, self._stepper.potential)
+        same = step_shape(problem, surface=True) == self._shape and settings == self._settings
+        return not same or not self._constants.hold(problem, potential)
 
 
 class _Frame(_Fixed):
     """The whole step as one compiled function."""
 
-    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int) -> None:
-        super().__init__(stepper, problem, places)
-        memory, given = self._inputs.tensors, (self._potential, self._known, plan_for(self._known), places, stepper.settings)
+    def __init__(self, potential: Potential, settings: NewtonSettings, problem: StepProblem, places: int) -> None:
+        super().__init__(potential, settings, problem, places)
+        memory, given = self._inputs.tensors, (self._potential, self._known, plan_for(self._known), places, settings)
         with whole_arrays():
             NewtonFrame(*given)(*memory)  # what is made once per cloth is made now: a trace has no values for it
         frame = NewtonFrame(*given, dense=True)
@@ -156,10 +201,13 @@ class _Frame(_Fixed):
         *self._reached, faces = self._run(*self._inputs.load(step_inputs(problem, surface=True)))
         return int(faces)
 
-    def minimize(self, problem: StepProblem, began: float) -> tuple[Tensor, Report]:
+    def minimize(
+        self, problem: StepProblem, began: float, start: Tensor | None, proceed: Proceed | None
+    ) -> tuple[Tensor, Report]:
         """Positions (V, 3) m at t + 1 of the problem whose step has been taken; its potential is not known, and of conjugate
         gradients the most that there can have been."""
-        settings, (pos, acc, residual) = self._stepper.settings, (value.clone() for value in self._reached)
+        assert start is None and proceed is None, "all iterations are one function"
+        settings, (pos, acc, residual) = self._settings, (value.clone() for value in self._reached)
         left = [(math.isfinite(value), value > settings.target_rg) for value in residual.tolist()]
         reason = tuple(reason_of(finite, wanted, False, MOST_ITERATIONS) for finite, wanted in left)
         converged = residual <= settings.target_rg
@@ -170,12 +218,13 @@ class _Frame(_Fixed):
 class _Plan(_Fixed):
     """The pieces for problems of one shape."""
 
-    def __init__(self, stepper: NewtonStepper, problem: StepProblem, places: int, captured: bool) -> None:
-        super().__init__(stepper, problem, places)
-        settings, potential = stepper.settings, self._potential
-        self._folds, record = keeps_both_sides(potential), _recorded if captured else None
+    def __init__(
+        self, potential: Potential, settings: NewtonSettings, problem: StepProblem, places: int, captured: bool
+    ) -> None:
+        super().__init__(potential, settings, problem, places)
+        self._folds, record = keeps_both_sides(self._potential), _recorded if captured else None
         self._system = FixedSystem(
-            potential, self._read, plan_for(self._known), settings.cg_iterations, settings.double, record
+            self._potential, self._read, plan_for(self._known), settings.cg_iterations, settings.double, record
         )
 
     def enter(self, problem: StepProblem) -> int:
@@ -184,12 +233,13 @@ class _Plan(_Fixed):
         self._system.enter()
         return int(self._faces)
 
-    def minimize(self, problem: StepProblem, began: float) -> tuple[Tensor, Report]:
+    def minimize(
+        self, problem: StepProblem, began: float, start: Tensor | None, proceed: Proceed | None
+    ) -> tuple[Tensor, Report]:
         """Positions (V, 3) at t + 1 of the problem that has been taken up."""
-        settings = self._stepper.settings
-        self._system.begin(None)
-        like = problem.state.pos.double() if settings.double else problem.state.pos
-        pos, report = run(self._system, like, settings, began, None)
+        self._system.begin(start)
+        like = problem.state.pos.double() if self._settings.double else problem.state.pos
+        pos, report = run(self._system, like, self._settings, began, proceed)
         return rounded(problem, pos), report
 
     def _read(self) -> StepProblem:
