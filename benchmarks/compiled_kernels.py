@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from gpu import SOLVER, Bench, frame_settings
+from gpu_frames import SOLVER, Bench, frame_settings
 from roofline import DATA_SHEETS
 
 from hood.assets.files.library import locate

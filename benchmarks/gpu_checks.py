@@ -32,6 +32,7 @@ DEVICE = "cuda"
 SHORT = ("num_frames=10", "video=none", "sheet=false", "settle=paper", "fail_on=nothing")
 NETWORK = ("rollout", "garment=tshirt", "checkpoint=quickstart", "refine=0", "kernels=torch", *SHORT)
 SOLVER = ("rollout", "garment=tshirt", "stepper=newton", *SHORT)
+REFINED = ("rollout", "garment=tshirt", "checkpoint=quickstart", "refine=2", "kernels=torch", *SHORT)
 OUTFIT = ("rollout", "garment=[tank,skirt]", "sequence=plie", "stepper=newton", *SHORT, "num_frames=4")
 TRAINING = ("train", "trainer.statistics_iterations=10", "trainer.iterations=60", "trainer.log_every=10")
 PAPER = (*TRAINING, "experiment=paper_fast", "trainer.schedule.every=60", "trainer.horizon.every=20",
@@ -181,6 +182,8 @@ CHECKS: list[Check] = [
      trained(PAPER, "paper", "trainer.step=captured", "trainer.precision=bf16")),
     ("solver captured, from the CPU's", 1e-6, "m",
      same_as_cpu((*SOLVER, "metrics=none", "guard=off"), "solver", "step=captured")),
+    ("refinement captured, from the CPU's", 1e-5, "m",
+     same_as_cpu((*REFINED, "metrics=none", "guard=off"), "refinement", "step=captured")),
 ]  # fmt: skip
 
 

@@ -9,7 +9,6 @@ import contextlib
 import csv
 import io
 import json
-import os
 import shutil
 import sys
 import traceback
@@ -185,21 +184,36 @@ def evaluate(folder: Path) -> dict[str, object]:
     return {"codes": codes, "rows": [len(one) for one in rows]}
 
 
-def benchmark(folder: Path) -> dict[str, object]:
-    """Every job of ``benchmarks/gpu.py`` on one small garment. Times mean nothing; constants are those of a data sheet."""
-    place = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
-    module = types.ModuleType("gpu_on_standin")
-    module.__file__ = str(place)
+#: Runs a job of ``benchmarks/gpu.py`` there. Times mean nothing; constants are those of a data sheet.
+JOB_ON_STANDIN = "import standin, ways; ways.benchmark_job()"
+
+
+def benchmark_job() -> None:
+    place = Path(__file__).parents[2] / "benchmarks" / "gpu_frames.py"
+    module = types.ModuleType("gpu_frames_on_standin")
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(place.parent))
-    exec(compile(standin.otherwise(place.read_text(encoding="utf-8")), module.__file__, "exec"), vars(module))
-    vars(module).update(measured_device=lambda: module.DATA_SHEETS["h100"], count_launches=lambda call: (call(), 0)[1])
-    os.environ.update({key: os.environ.get(key, value) for key, value in module.ENVIRONMENT.items()})  # or it starts anew
-    folder.mkdir()
-    sys.argv = ["gpu.py", "--sizes", "1000", "--models", "small-ours", "--minutes", "8", "--csv", str(folder / "gpu.csv")]
+    exec(compile(standin.otherwise(place.read_text(encoding="utf-8")), str(place), "exec"), vars(module))
+    vars(module).update(
+        measured_device=lambda: module.DATA_SHEETS["h100"],
+        count_launches=lambda call: (call(), 0)[1],
+        device_memory=lambda call: (call(), 0.0)[1],
+    )
     module.main()
+
+
+def benchmark(folder: Path) -> dict[str, object]:
+    """Jobs of ``benchmarks/gpu.py`` on one small garment: rows of those that end, a line of one that does not."""
+    sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+    import gpu
+
+    folder.mkdir()
+    gpu.COMMAND, gpu.COUNTS = (sys.executable, "-P", "-c", JOB_ON_STANDIN), (2,)
+    words = ["--sizes", "1000", "--models", "small-ours", "nosuch", "--minutes", "8", "--csv", str(folder / "gpu.csv")]
+    sys.argv = ["gpu.py", *words]
+    code = gpu.main()
     rows = list(csv.DictReader((folder / "gpu.csv").read_text().splitlines()))
-    return {"ways": sorted({f"{row['method']} {row['way']}" for row in rows})}
+    return {"code": code, "ways": sorted({f"{row['method']} {row['way']}" for row in rows})}
 
 
 #: A check of a GPU as it is, and one that a core can take.

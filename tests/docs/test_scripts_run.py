@@ -41,6 +41,7 @@ RUN = (
     ),
     Run(r"convergence\.py garment", "--sizes 1k --fps 30 --methods newton", r"1k +30 +newton", slow=True),
     Run(r"convergence\.py strip", "", r"\(0\.\d+\)", slow=True),
+    Run(r"gpu_frames\.py", "", r'"method": "newton 1"', (r"newton 5", "newton 1")),
     Run(r"step_distance\.py --cost", "--garments tank --motions plie --frames 3", r"tank +plie +guess\+5 +\d", slow=True),
     Run(
         r"step_distance\.py --rows",

@@ -14,11 +14,25 @@ def _axis(pointer, rows, present, AXIS: tl.constexpr):
 
 
 @triton.jit
+def _first_of(scenes, number, scene):
+    """The first entry of ``scenes``, ascending, that is at least ``scene``."""
+    low, high = number * 0, number
+    while low < high:
+        middle = (low + high) // 2
+        if tl.load(scenes + middle) < scene:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@triton.jit
 def nearest_pass(
     points, point_scene, vertices, vertex_scene, usable, index, away, count, number, TILE: tl.constexpr, CHUNK: tl.constexpr
 ):
     """Of TILE points the three nearest usable vertices of their scene, ascending, the first of equals first, and distances;
-    where there is none, the nearest again and an infinite one. No distance but these is kept."""
+    where there is none, the nearest again and an infinite one. No distance but these is kept. Scenes are ascending: vertices
+    of other ones than those of the points are passed over."""
     rows = tl.program_id(0) * TILE + tl.arange(0, TILE)
     inside = rows < count
     x, y, z = _axis(points, rows, inside, 0), _axis(points, rows, inside, 1), _axis(points, rows, inside, 2)
@@ -26,10 +40,11 @@ def nearest_pass(
     far = float("inf")
     first, second, third = x * 0.0 + far, x * 0.0 + far, x * 0.0 + far
     here, next_one, last = rows * 0, rows * 0, rows * 0
-    begin = count * 0
-    while begin < number:
+    begin = _first_of(vertex_scene, number, tl.load(point_scene + tl.program_id(0) * TILE))
+    end = _first_of(vertex_scene, number, tl.load(point_scene + tl.minimum(tl.program_id(0) * TILE + TILE, count) - 1) + 1)
+    while begin < end:
         others = begin + tl.arange(0, CHUNK)
-        present = others < number
+        present = others < end
         counts = tl.load(usable + others, mask=present, other=0) != 0
         apart = x[:, None] - _axis(vertices, others, present, 0)[None, :]
         total = apart * apart

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from hood.mesh import geometry
+from hood.tensors.precision import has_triton
 
 #: Pairs evaluated at once on an accelerator: bounds the memory.
 _CHUNK_PAIRS = 4_000_000
@@ -74,7 +75,7 @@ def nearest_three(
     infinite where there is none; the nearest is then repeated. One kernel, in Triton.
 
     Args:
-        points: (N, 3) m, finite. The others as in :func:`nearest_vertices`.
+        points: (N, 3) m, finite. The others as in :func:`nearest_vertices`, scenes ascending.
     """
     index = torch.empty(len(points), 3, dtype=torch.int64, device=points.device)
     away = points.new_empty(len(points), 3)
@@ -148,7 +149,8 @@ def nearest_dense(
     usable: Tensor | None = None,
     radius: float = float("inf"),
 ) -> Nearest:
-    """The same as :func:`nearest_vertices` by all pairs, what an accelerator is fast at; the first of equals wins.
+    """The same as :func:`nearest_vertices` by all pairs, what an accelerator is fast at; the first of equals wins. With Triton
+    these are pairs of one scene, which have to be ascending then.
 
     No shape depends on data and the host waits for nothing, so that the search can be part of a captured graph.
     """
@@ -158,6 +160,14 @@ def nearest_dense(
         return Nearest(index, points.new_full((num_points,), torch.inf))
     query = torch.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
     candidates = _finite(vertices) if usable is None else _finite(vertices) & usable
+    if has_triton(points.device):
+        none = torch.zeros_like(candidates, dtype=torch.int64)
+        scenes = (
+            (none.new_zeros(num_points), none) if point_scene is None or vertex_scene is None else (point_scene, vertex_scene)
+        )
+        found, away = nearest_three(query, scenes[0], vertices, scenes[1], candidates)
+        within = away[:, 0] < radius
+        return Nearest(torch.where(within, found[:, 0], 0), torch.where(within, away[:, 0], torch.inf))
     targets = torch.where(candidates.unsqueeze(1), vertices, torch.inf)
     separate = False
     if point_scene is not None and vertex_scene is not None:

@@ -206,7 +206,7 @@ class _Frame(_Fixed):
     ) -> tuple[Tensor, Report]:
         """Positions (V, 3) m at t + 1 of the problem whose step has been taken; its potential is not known, and of conjugate
         gradients the most that there can have been."""
-        assert start is None and proceed is None, "all iterations are one function"
+        assert start is proceed is None, "all iterations are one function"
         settings, (pos, acc, residual) = self._settings, (value.clone() for value in self._reached)
         left = [(math.isfinite(value), value > settings.target_rg) for value in residual.tolist()]
         reason = tuple(reason_of(finite, wanted, False, MOST_ITERATIONS) for finite, wanted in left)
