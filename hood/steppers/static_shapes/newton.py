@@ -64,7 +64,7 @@ class CapturedNewton:
         if mode == "captured" and not has_graphs(stepper.gravity.device):
             raise ValueError("step=captured needs device=cuda, a CPU has no graphs to replay; use step=fixed or step=plain")
         settings = stepper.settings
-        check_settings(settings)
+        require_pieces(settings)
         if mode == "compiled" and (settings.max_iterations > MOST or settings.cg_iterations > MOST_CG):
             raise ValueError(
                 f"step=compiled takes all of solver.max_iterations={settings.max_iterations} and cg_iterations="
@@ -103,7 +103,7 @@ class CapturedNewton:
         return self.stepper.next_velocity(problem, prediction)
 
 
-def check_settings(settings: NewtonSettings) -> None:
+def require_pieces(settings: NewtonSettings) -> None:
     """Raise ValueError where they have no form of fixed shapes."""
     if settings.linear != "cg":
         raise ValueError(f"solver.linear={settings.linear} has no form of fixed shapes; use cg or step=plain")
@@ -156,7 +156,7 @@ def minimizer_for(mode: str, settings: NewtonSettings, device: torch.device) -> 
     Raises:
         ValueError: settings that have no such form.
     """
-    check_settings(settings)
+    require_pieces(settings)
     if mode == "compiled":
         return FixedMinimizer("captured") if has_graphs(device) else None
     return FixedMinimizer(mode)
