@@ -54,24 +54,31 @@ inline bool inside(int a, int b, int c) {
 }
 
 // Triangles of a leaf that share no vertex with one of another leaf.
-inline I8 strangers(const Eights& e, int64_t leaf, int i, int64_t other) {
-    N8 same = N8{};
-    for (int c = 0; c < 3; ++c)
-        for (int d = 0; d < 3; ++d)
-            same |= load<N8>(e.vertex + LANES * (3 * other + d)) == e.vertex[LANES * (3 * leaf + c) + i];
-    return __builtin_convertvector(~same, I8);
+inline uint64_t strangers(const Eights& e, int64_t leaf, int i, int64_t other) {
+    return lanes_of([&](int at) {
+        NN same = NN{};
+        for (int c = 0; c < 3; ++c)
+            for (int d = 0; d < 3; ++d)
+                same |= load<NN>(e.vertex + LANES * (3 * other + d) + at) == e.vertex[LANES * (3 * leaf + c) + i];
+        return ~same;
+    });
 }
 
 // Triangles of a leaf of b with corners on both sides of the plane of a triangle of a, which has corners on both sides of theirs.
-inline I8 straddling(const Eights& a, int64_t leaf, int i, const Eights& b, int64_t other, double touch) {
+inline uint64_t straddling(const Eights& a, int64_t leaf, int i, const Eights& b, int64_t other, double touch) {
     const double *corner = a.corner + 9 * LANES * leaf + i, *normal = normals(a, leaf) + i;
     const double* corners = b.corner + 9 * LANES * other;
-    const auto theirs = [&](int c, int k) { return load<V8>(corners + LANES * (3 * c + k)); };
-    const auto own = [&](int c, int k) { return all(corner[LANES * (3 * c + k)]); };
-    const I8 first = on_both_sides(theirs, [&](int k) { return corner[LANES * k]; }, [&](int k) { return normal[LANES * k]; }, touch);
-    if (!lanes_of(first)) return first;
+    const uint64_t first = lanes_of([&](int at) {
+        const auto theirs = [&](int c, int k) { return load<VN>(corners + LANES * (3 * c + k) + at); };
+        return on_both_sides(theirs, [&](int k) { return corner[LANES * k]; }, [&](int k) { return normal[LANES * k]; }, touch);
+    });
+    if (!first) return 0;
     const double* up = normals(b, other);
-    return first & on_both_sides(own, [&](int k) { return theirs(0, k); }, [&](int k) { return load<V8>(up + LANES * k); }, touch);
+    return first & lanes_of([&](int at) {
+        const auto own = [&](int c, int k) { return every(corner[LANES * (3 * c + k)]); };
+        const auto point = [&](int k) { return load<VN>(corners + LANES * k + at); };
+        return on_both_sides(own, point, [&](int k) { return load<VN>(up + LANES * k + at); }, touch);
+    });
 }
 
 // Middle of the finite ones of some points, and the extent of the box around them.
@@ -153,35 +160,38 @@ struct Pile {
     }
 
     // Squared distances to eight boxes; infinite where there is none.
-    static V8 box_dist_sq(const double* sides, Vec p) {
-        V8 sum = all(0.0);
-        for (int k = 0; k < 3; ++k) {
-            const V8 gap = higher(load<V8>(sides + LANES * k) - axis(p, k), axis(p, k) - load<V8>(sides + LANES * (3 + k)));
-            const V8 out = higher(gap, all(0.0));
-            sum += out * out;
+    static void box_dist_sq(const double* sides, Vec p, double* away) {
+        for (int i = 0; i < LANES; i += AT_ONCE) {
+            VN sum = every(0.0);
+            for (int k = 0; k < 3; ++k) {
+                const VN gap = higher(load<VN>(sides + LANES * k + i) - axis(p, k), axis(p, k) - load<VN>(sides + LANES * (3 + k) + i));
+                const VN out = higher(gap, every(0.0));
+                sum += out * out;
+            }
+            store(away + i, sum);
         }
-        return sum;
     }
 
     // The nearest face within a squared distance, the first one of several, or -1; the squared distance and weights of its point.
     int64_t nearest(Vec p, double& best, double* weights) const {
         double least = INFINITY;
         int64_t likely = -1, number = -1;
-        for (size_t i = 0; i < away.size(); i += LANES) store(away.data() + i, box_dist_sq(groups.data() + 6 * i, p));
+        for (size_t i = 0; i < away.size(); i += LANES) box_dist_sq(groups.data() + 6 * i, p, away.data() + i);
         for (size_t i = 0; i < away.size(); ++i)
             if (away[i] < least) least = away[i], likely = (int64_t)i;
         if (!(least <= best * (1.0 + 1e-9))) return -1;
         const auto look_into = [&](int64_t leaf) {
-            const V8 gap = box_dist_sq(boxes.data() + 6 * LANES * leaf, p);
-            each_lane(lanes_of(gap <= best * (1.0 + 1e-9)), [&](int lane) {
-                if (!(gap[lane] <= best * (1.0 + 1e-9))) return;
+            double gap[LANES];
+            box_dist_sq(boxes.data() + 6 * LANES * leaf, p, gap);
+            for (int lane = 0; lane < LANES; ++lane) {
+                if (!(gap[lane] <= best * (1.0 + 1e-9))) continue;
                 const int64_t f = face[LANES * leaf + lane], *corner = faces + 3 * f;
                 double at_point[3];
                 const double dist_sq = closest(p, at(pos, corner[0]), at(pos, corner[1]), at(pos, corner[2]), at_point);
-                if (!(dist_sq < best || (dist_sq == best && (number < 0 || f < number)))) return;
+                if (!(dist_sq < best || (dist_sq == best && (number < 0 || f < number)))) continue;
                 best = dist_sq, number = f;
                 std::copy(at_point, at_point + 3, weights);
-            });
+            }
         };
         // The leaf whose box is nearest first: it leaves few others to look at.
         look_into(likely);
@@ -285,8 +295,8 @@ void crossing_find(const Eights* first, const Eights* second, int64_t same, doub
             uint64_t met = overlapped(boxes, box_in(first->boxes + 6 * LANES * leaf, i));
             // Of two triangles of one leaf once.
             if (same && leaf == other) met &= ((uint64_t)1 << 8 * i) - 1;
-            if (met && same) met &= lanes_of(strangers(*first, leaf, i, other));
-            if (met) met &= lanes_of(straddling(*first, leaf, i, *second, other, touch));
+            if (met && same) met &= strangers(*first, leaf, i, other);
+            if (met) met &= straddling(*first, leaf, i, *second, other, touch);
             each_lane(met, [&](int j) {
                 const Triangle a = triangle(*first, leaf, i), b = triangle(*second, other, j);
                 if (same && b.number < a.number) examine(b, a);
@@ -391,13 +401,13 @@ struct Cloud {
     bool any_within(Vec p, double dist) const {
         constexpr size_t STEP = 64 * LANES;
         for (size_t begin = 0; begin < row[0].size(); begin += STEP) {
-            V8 least = all(INFINITY);
-            for (size_t i = begin; i < std::min(begin + STEP, row[0].size()); i += LANES) {
-                const V8 x = load<V8>(&row[0][i]) - p.x, y = load<V8>(&row[1][i]) - p.y, z = load<V8>(&row[2][i]) - p.z;
+            VN least = every(INFINITY);
+            for (size_t i = begin; i < std::min(begin + STEP, row[0].size()); i += AT_ONCE) {
+                const VN x = load<VN>(&row[0][i]) - p.x, y = load<VN>(&row[1][i]) - p.y, z = load<VN>(&row[2][i]) - p.z;
                 least = lower(x * x + y * y + z * z, least);
             }
             double dist_sq = least[0];
-            for (int i = 1; i < LANES; ++i) dist_sq = std::min(dist_sq, least[i]);
+            for (int i = 1; i < AT_ONCE; ++i) dist_sq = std::min(dist_sq, least[i]);
             if (std::sqrt(dist_sq) < dist) return true;
         }
         return false;

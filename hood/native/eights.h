@@ -28,22 +28,26 @@ namespace {
 constexpr int MOST_LEVELS = 12;
 constexpr double EPS = 2.220446049250313e-16;
 
-typedef int8_t B8 __attribute__((vector_size(8)));
-typedef int32_t N8 __attribute__((vector_size(32)));
+typedef int8_t BN __attribute__((vector_size(AT_ONCE)));
+typedef int32_t NN __attribute__((vector_size(4 * AT_ONCE)));
 
-// A byte of 1 for every lane that holds, the first one lowest.
-template <class M> inline uint64_t lanes_of(M mask) {
-    const B8 bytes = __builtin_convertvector(mask, B8);
-    uint64_t bits;
-    std::memcpy(&bits, &bytes, sizeof(bits));
-    return bits & 0x0101010101010101u;
+// A byte of 1 for every one of eight lanes that holds, the first one lowest; by parts that begin at a number.
+template <class Part> inline uint64_t lanes_of(const Part& part) {
+    uint64_t all = 0;
+    for (int i = 0; i < LANES; i += AT_ONCE) {
+        const BN bytes = __builtin_convertvector(part(i), BN);
+        uint64_t bits = 0;
+        std::memcpy(&bits, &bytes, sizeof(bytes));
+        all |= bits << 8 * i;
+    }
+    return all & 0x0101010101010101u;
 }
 template <class Visit> inline void each_lane(uint64_t lanes, Visit visit) {
     for (; lanes; lanes &= lanes - 1) visit(__builtin_ctzll(lanes) / 8);
 }
 
-inline V8 lower(V8 a, V8 b) { return a < b ? a : b; }
-inline V8 higher(V8 a, V8 b) { return a > b ? a : b; }
+inline VN lower(VN a, VN b) { return a < b ? a : b; }
+inline VN higher(VN a, VN b) { return a > b ? a : b; }
 
 struct Box {
     double low[3], high[3];
@@ -57,10 +61,12 @@ inline Box box_in(const double* sides, int lane) {
 
 // Which of eight boxes a box overlaps or touches.
 inline uint64_t overlapped(const double* sides, const Box& box) {
-    I8 apart = I8{};
-    for (int k = 0; k < 3; ++k)
-        apart |= (load<V8>(sides + LANES * k) > box.high[k]) | (load<V8>(sides + LANES * (3 + k)) < box.low[k]);
-    return lanes_of(~apart);
+    return lanes_of([&](int i) {
+        IN apart = IN{};
+        for (int k = 0; k < 3; ++k)
+            apart |= (load<VN>(sides + LANES * k + i) > box.high[k]) | (load<VN>(sides + LANES * (3 + k) + i) < box.low[k]);
+        return ~apart;
+    });
 }
 
 // What is around eight boxes goes to a lane of others.
@@ -94,10 +100,7 @@ inline void fit_groups(const double* boxes, int64_t num_leaves, double* groups) 
     for (int level = 0; level < levels.count; ++level) {
         const int64_t next = levels.first[level + 1] - levels.first[level];
         double* into = groups + 6 * LANES * levels.first[level];
-        for (int64_t i = 0; i < 3 * next; ++i) {
-            const int64_t at = 6 * LANES * (i / 3) + LANES * (i % 3);
-            store(into + at, all(INFINITY)), store(into + at + 3 * LANES, all(-INFINITY));
-        }
+        for (int64_t i = 0; i < 6 * LANES * next; ++i) into[i] = i / (3 * LANES) % 2 ? -INFINITY : INFINITY;
         for (int64_t i = 0; i < size; ++i) surround(from + 6 * LANES * i, into + 6 * LANES * (i / LANES), i % LANES);
         from = into, size = next;
     }
@@ -131,16 +134,19 @@ inline void place(const Eights& e, const double* origin) {
             for (int i = 0; i < LANES; ++i)
                 for (int k = 0; k < 3; ++k)
                     corner[LANES * (3 * c + k) + i] = e.pos[3 * (int64_t)vertex[LANES * c + i] + k];
-        I8 usable = __builtin_convertvector(load<N8>(e.order + LANES * leaf) >= 0, I8);
-        for (int j = 0; j < 9; ++j) {
-            const V8 value = load<V8>(corner + LANES * j) - origin[j % 3];
-            store(corner + LANES * j, value);
-            usable &= value - value == 0.0;
-        }
-        for (int k = 0; k < 3; ++k) {
-            const V8 a = load<V8>(corner + LANES * k), b = load<V8>(corner + LANES * (3 + k)), c = load<V8>(corner + LANES * (6 + k));
-            store(e.boxes + LANES * (6 * leaf + k), usable ? lower(lower(a, b), c) : all(INFINITY));
-            store(e.boxes + LANES * (6 * leaf + 3 + k), usable ? higher(higher(a, b), c) : all(-INFINITY));
+        for (int at = 0; at < LANES; at += AT_ONCE) {
+            IN usable = __builtin_convertvector(load<NN>(e.order + LANES * leaf + at) >= 0, IN);
+            VN value[9];
+            for (int j = 0; j < 9; ++j) {
+                value[j] = load<VN>(corner + LANES * j + at) - origin[j % 3];
+                store(corner + LANES * j + at, value[j]);
+                usable &= value[j] - value[j] == 0.0;
+            }
+            for (int k = 0; k < 3; ++k) {
+                const VN a = value[k], b = value[3 + k], c = value[6 + k];
+                store(e.boxes + LANES * (6 * leaf + k) + at, usable ? lower(lower(a, b), c) : every(INFINITY));
+                store(e.boxes + LANES * (6 * leaf + 3 + k) + at, usable ? higher(higher(a, b), c) : every(-INFINITY));
+            }
         }
         e.has_normals[leaf] = 0;
     }
@@ -152,28 +158,30 @@ inline const double* normals(const Eights& e, int64_t leaf) {
     double* normal = e.normal + 3 * LANES * leaf;
     if (e.has_normals[leaf]) return normal;
     e.has_normals[leaf] = 1;
-    const double* corner = e.corner + 9 * LANES * leaf;
-    V8 first[3], second[3], product[3];
-    for (int k = 0; k < 3; ++k) {
-        const V8 a = load<V8>(corner + LANES * k);
-        first[k] = load<V8>(corner + LANES * (3 + k)) - a, second[k] = load<V8>(corner + LANES * (6 + k)) - a;
+    for (int at = 0; at < LANES; at += AT_ONCE) {
+        const double* corner = e.corner + 9 * LANES * leaf + at;
+        VN first[3], second[3], product[3];
+        for (int k = 0; k < 3; ++k) {
+            const VN a = load<VN>(corner + LANES * k);
+            first[k] = load<VN>(corner + LANES * (3 + k)) - a, second[k] = load<VN>(corner + LANES * (6 + k)) - a;
+        }
+        cross(first, second, product);
+        const VN length = root(dot(product, product)), limit = 16.0 * EPS * root(dot(first, first)) * root(dot(second, second));
+        // Below this the direction is rounding alone.
+        const IN flat = length <= limit;
+        for (int k = 0; k < 3; ++k) store(normal + LANES * k + at, flat ? every(0.0) : 1.0 / length * product[k]);
     }
-    cross(first, second, product);
-    const V8 length = root(dot(product, product)), limit = 16.0 * EPS * root(dot(first, first)) * root(dot(second, second));
-    // Below this the direction is rounding alone.
-    const I8 flat = length <= limit;
-    for (int k = 0; k < 3; ++k) store(normal + LANES * k, flat ? all(0.0) : 1.0 / length * product[k]);
     return normal;
 }
 
-// Lanes whose corners lie on both sides of planes; planes by a point and a normal, each in eight or one for all.
+// Lanes whose corners lie on both sides of planes; planes by a point and a normal, each in lanes or one for all.
 template <class Corner, class Point, class Normal>
-inline I8 on_both_sides(Corner corner, Point point, Normal normal, double touch) {
-    I8 below = I8{}, above = I8{};
+inline IN on_both_sides(Corner corner, Point point, Normal normal, double touch) {
+    IN below = IN{}, above = IN{};
     for (int c = 0; c < 3; ++c) {
-        V8 away[3], up[3];
-        for (int k = 0; k < 3; ++k) away[k] = corner(c, k) - point(k), up[k] = all(0.0) + normal(k);
-        const V8 height = dot(away, up);
+        VN away[3], up[3];
+        for (int k = 0; k < 3; ++k) away[k] = corner(c, k) - point(k), up[k] = every(0.0) + normal(k);
+        const VN height = dot(away, up);
         below |= height < -touch, above |= height > touch;
     }
     return below & above;

@@ -1,7 +1,7 @@
 // Energies of membrane and bending, and of what acts on single vertices, with their gradients, and edge strain: one pass over the
 // elements of a cloth, in float64.
 //
-// Elements are taken eight at a time, one per lane; what they give is added up in their order, so that a result is the same in
+// Elements are taken some at a time, one per lane; what they give is added up in their order, so that a result is the same in
 // every run. Tables of elements are padded to a multiple of eight.
 #include <algorithm>
 #include <cmath>
@@ -13,17 +13,17 @@
 
 namespace {
 
-inline V8 larger(V8 a, V8 b) { return a > b ? a : b; }
-inline V8 largest(const V8* a) { return larger(magnitude(a[0]), larger(magnitude(a[1]), magnitude(a[2]))); }
+inline VN larger(VN a, VN b) { return a > b ? a : b; }
+inline VN largest(const VN* a) { return larger(magnitude(a[0]), larger(magnitude(a[1]), magnitude(a[2]))); }
 
 // Adds the energies of ``count`` lanes to their scenes.
-inline void add_energy(V8 value, const int32_t* scene, int count, double* energy) {
+inline void add_energy(VN value, const int32_t* scene, int count, double* energy) {
     for (int lane = 0; lane < count; ++lane) energy[scene[lane]] += value[lane];
 }
 
 // Adds forces on CORNERS corners of ``count`` elements, of a table of ``padded`` ones, to the gradient.
-template <int CORNERS> inline void scatter(const V8 (*force)[3], const int32_t* corners, int64_t padded, int count, double* gradient) {
-    alignas(64) double table[CORNERS][3][LANES];
+template <int CORNERS> inline void scatter(const VN (*force)[3], const int32_t* corners, int64_t padded, int count, double* gradient) {
+    alignas(64) double table[CORNERS][3][AT_ONCE];
     for (int c = 0; c < CORNERS; ++c)
         for (int k = 0; k < 3; ++k) store(table[c][k], force[c][k]);
     for (int lane = 0; lane < count; ++lane)
@@ -51,16 +51,16 @@ struct Hinges {
 // Adds the membrane's energies [J] to those of the scenes, and its gradient (V, 3) [N] if there is room for it.
 void elements_faces(const Faces* faces, const double* pos, double* energy, double* gradient) {
     const int64_t padded = faces->padded;
-    for (int64_t i = 0; i < faces->count; i += LANES) {
-        const int count = (int)std::min<int64_t>(LANES, faces->count - i);
+    for (int64_t i = 0; i < faces->count; i += AT_ONCE) {
+        const int count = (int)std::min<int64_t>(AT_ONCE, faces->count - i);
         const int32_t* corners = faces->corners + i;
-        V8 offset[2][3], f[2][3], m[4];
+        VN offset[2][3], f[2][3], m[4];
         offsets_of<3, 3>(pos, corners, padded, offset);
-        for (int c = 0; c < 4; ++c) m[c] = load<V8>(faces->inverse + c * padded + i);
+        for (int c = 0; c < 4; ++c) m[c] = load<VN>(faces->inverse + c * padded + i);
         for (int a = 0; a < 2; ++a)
             for (int k = 0; k < 3; ++k) f[a][k] = m[a] * offset[0][k] + m[2 + a] * offset[1][k];
         const Strain g = green_strain(f);
-        const V8 weight = load<V8>(faces->weight + i);
+        const VN weight = load<VN>(faces->weight + i);
         const auto add = [&](const auto& law) {
             add_energy(weight * density_of(law, g), faces->scene + i, count, energy);
             return stress_of(law, g, weight);
@@ -68,15 +68,15 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
         Stress s;
         if (faces->weave) {
             const double* roots = faces->weave + i;
-            s = add(Weave{load<V8>(roots), load<V8>(roots + padded), load<V8>(roots + 2 * padded), load<V8>(roots + 3 * padded)});
+            s = add(Weave{load<VN>(roots), load<VN>(roots + padded), load<VN>(roots + 2 * padded), load<VN>(roots + 3 * padded)});
         } else {
-            s = add(Isotropic{load<V8>(faces->mu + i), load<V8>(faces->lambda + i)});
+            s = add(Isotropic{load<VN>(faces->mu + i), load<VN>(faces->lambda + i)});
         }
         if (!gradient) continue;
         // First Piola-Kirchhoff stress F S, pulled back to the two edges.
-        V8 force[3][3];
+        VN force[3][3];
         for (int k = 0; k < 3; ++k) {
-            const V8 p0 = s.s00 * f[0][k] + s.s01 * f[1][k], p1 = s.s01 * f[0][k] + s.s11 * f[1][k];
+            const VN p0 = s.s00 * f[0][k] + s.s01 * f[1][k], p1 = s.s01 * f[0][k] + s.s11 * f[1][k];
             force[1][k] = m[0] * p0 + m[1] * p1, force[2][k] = m[2] * p0 + m[3] * p1;
             force[0][k] = -(force[1][k] + force[2][k]);
         }
@@ -87,22 +87,22 @@ void elements_faces(const Faces* faces, const double* pos, double* energy, doubl
 // The same for bending; hinges with a degenerate face have the angle 0 and no force.
 void elements_hinges(const Hinges* hinges, const double* pos, double* energy, double* gradient) {
     const int64_t padded = hinges->padded;
-    for (int64_t i = 0; i < hinges->count; i += LANES) {
-        const int count = (int)std::min<int64_t>(LANES, hinges->count - i);
+    for (int64_t i = 0; i < hinges->count; i += AT_ONCE) {
+        const int count = (int)std::min<int64_t>(AT_ONCE, hinges->count - i);
         const int32_t* corners = hinges->corners + i;
-        V8 offset[3][3], force[4][3];
+        VN offset[3][3], force[4][3];
         offsets_of<4, 3>(pos, corners, padded, offset);
-        const V8* edge = offset[0];
-        const V8 scale = 1.0 / larger(larger(largest(edge), larger(largest(offset[1]), largest(offset[2]))), all(TINY));
+        const VN* edge = offset[0];
+        const VN scale = 1.0 / larger(larger(largest(edge), larger(largest(offset[1]), largest(offset[2]))), every(TINY));
         Hinge h;
         hinge_of(offset, scale, h);
-        const V8 weight = load<V8>(hinges->weight + i), factor = hinges->current_length ? weight * dot(edge, edge) : weight;
-        const V8 bend = hinges->current_length ? h.angle : bend_of(h.angle, load<V8>(hinges->rest_angle + i));
+        const VN weight = load<VN>(hinges->weight + i), factor = hinges->current_length ? weight * dot(edge, edge) : weight;
+        const VN bend = hinges->current_length ? h.angle : bend_of(h.angle, load<VN>(hinges->rest_angle + i));
         add_energy(bending_energy(factor, bend), hinges->scene + i, count, energy);
         if (!gradient) continue;
         hinge_slopes(h, -factor * bend * h.length * scale, force);
         if (hinges->current_length) {
-            const V8 stretch = weight * bend * bend;
+            const VN stretch = weight * bend * bend;
             for (int k = 0; k < 3; ++k) force[0][k] -= stretch * edge[k], force[1][k] += stretch * edge[k];
         }
         scatter<4>(force, corners, padded, count, gradient);

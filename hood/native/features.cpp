@@ -9,9 +9,16 @@ namespace {
 
 typedef float F4 __attribute__((vector_size(16)));
 
-constexpr int LANES = 16;   // numbers that are compressed at a time
-typedef float V16 __attribute__((vector_size(4 * LANES)));
-typedef int32_t I16 __attribute__((vector_size(4 * LANES)));
+// Numbers that are compressed at a time.
+#if defined(__AVX512F__)
+constexpr int LANES = 16;
+#elif defined(__AVX__)
+constexpr int LANES = 8;
+#else
+constexpr int LANES = 4;
+#endif
+typedef float V __attribute__((vector_size(4 * LANES)));
+typedef int32_t I __attribute__((vector_size(4 * LANES)));
 
 inline F4 load(const float* p) {
     F4 v;
@@ -23,7 +30,7 @@ inline void store(float* p, F4 v) { std::memcpy(p, &v, sizeof v); }
 inline float dot(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 inline float length(const float* a) { return std::sqrt(dot(a, a)); }
 
-inline V16 root(V16 v) {
+inline V root(V v) {
     alignas(64) float lanes[LANES];
     std::memcpy(lanes, &v, sizeof v);
     for (int i = 0; i < LANES; ++i) lanes[i] = std::sqrt(lanes[i]);
@@ -32,22 +39,22 @@ inline V16 root(V16 v) {
 }
 
 // asinh, to two units of rounding: log1p(y + y^2 / (1 + sqrt(1 + y^2))) of the magnitude y; where y^2 is too large, log(y) + log 2.
-inline V16 asinh_of(V16 x) {
-    const I16 sign = (I16)x & (int32_t)0x80000000;
-    const V16 y = (V16)((I16)x ^ sign), zero = V16{};
-    const I16 large = y > 1e9f;
-    const V16 small = large ? zero : y;
-    const V16 s = large ? y : small + small * small / (1.0f + root(1.0f + small * small)), u = 1.0f + s;
-    const V16 lost = (s - (u - 1.0f)) / u;  // what the sum has rounded away
+inline V asinh_of(V x) {
+    const I sign = (I)x & (int32_t)0x80000000;
+    const V y = (V)((I)x ^ sign), zero = V{};
+    const I large = y > 1e9f;
+    const V small = large ? zero : y;
+    const V s = large ? y : small + small * small / (1.0f + root(1.0f + small * small)), u = 1.0f + s;
+    const V lost = (s - (u - 1.0f)) / u;  // what the sum has rounded away
     // u = m 2^e with m between sqrt(1/2) and sqrt(2).
-    const I16 shifted = (I16)u - 0x3f3504f3, exponent = shifted >> 23;
-    const V16 m = (V16)((shifted & 0x7fffff) + 0x3f3504f3), e = __builtin_convertvector(exponent, V16);
-    const V16 z = (m - 1.0f) / (m + 1.0f), w = z * z;
-    const V16 series = 2.0f * z * (1.0f + w * (1.0f / 3 + w * (1.0f / 5 + w * (1.0f / 7 + w * (1.0f / 9)))));
+    const I shifted = (I)u - 0x3f3504f3, exponent = shifted >> 23;
+    const V m = (V)((shifted & 0x7fffff) + 0x3f3504f3), e = __builtin_convertvector(exponent, V);
+    const V z = (m - 1.0f) / (m + 1.0f), w = z * z;
+    const V series = 2.0f * z * (1.0f + w * (1.0f / 3 + w * (1.0f / 5 + w * (1.0f / 7 + w * (1.0f / 9)))));
     const float high = 0.693359375f, low = -2.12194440e-4f;  // of log 2
-    const V16 result = e * high + (series + lost + e * low) + (large ? zero + 0.69314718f : zero);
-    const V16 sound = y > 3.4028235e38f ? y : result;
-    return (V16)((I16)sound | sign);
+    const V result = e * high + (series + lost + e * low) + (large ? zero + 0.69314718f : zero);
+    const V sound = y > 3.4028235e38f ? y : result;
+    return (V)((I)sound | sign);
 }
 
 // Numbers on their way to asinh, and where they go.
@@ -61,7 +68,7 @@ struct Compressor {
         if (count == LANES) flush();
     }
     void flush() {
-        V16 v;
+        V v;
         std::memcpy(&v, values, sizeof v);
         v = asinh_of(v);
         std::memcpy(values, &v, sizeof v);

@@ -190,48 +190,48 @@ struct LayerTree {
     }
 };
 
-// ---- distances of eight pairs at a time ------------------------------------------------------------------------------------
+// ---- distances of some pairs at a time -------------------------------------------------------------------------------------
 
 struct Lanes3 {
-    V8 x, y, z;
+    VN x, y, z;
 };
 inline Lanes3 operator-(const Lanes3& a, const Lanes3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline V8 dot(const Lanes3& a, const Lanes3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline VN dot(const Lanes3& a, const Lanes3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 inline Lanes3 cross(const Lanes3& a, const Lanes3& b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-inline V8 less(V8 a, V8 b) { return a < b ? a : b; }
-inline V8 more(V8 a, V8 b) { return a > b ? a : b; }
+inline VN less(VN a, VN b) { return a < b ? a : b; }
+inline VN more(VN a, VN b) { return a > b ? a : b; }
 
 // Square of the distance of the end of ``from`` to the segment from 0 along ``along``.
-inline V8 segment_sq(const Lanes3& from, const Lanes3& along) {
-    const V8 size = dot(along, along), zero = all(0.0), one = all(1.0);
-    const V8 share = more(zero, less(one, dot(from, along) / (size > zero ? size : one)));
+inline VN segment_sq(const Lanes3& from, const Lanes3& along) {
+    const VN size = dot(along, along), zero = every(0.0), one = every(1.0);
+    const VN share = more(zero, less(one, dot(from, along) / (size > zero ? size : one)));
     const Lanes3 gap = {from.x - share * along.x, from.y - share * along.y, from.z - share * along.z};
     return dot(gap, gap);
 }
 
 // Squares of the distances of points to triangles, as point_triangle finds them.
-inline V8 point_triangle_sq(const Lanes3* x) {
-    const V8 zero = all(0.0), one = all(1.0);
+inline VN point_triangle_sq(const Lanes3* x) {
+    const VN zero = every(0.0), one = every(1.0);
     const Lanes3 first = x[2] - x[1], second = x[3] - x[1], third = x[3] - x[2], offset = x[0] - x[1];
-    const V8 best = less(segment_sq(offset, first), less(segment_sq(offset, second), segment_sq(x[0] - x[2], third)));
+    const VN best = less(segment_sq(offset, first), less(segment_sq(offset, second), segment_sq(x[0] - x[2], third)));
     const Lanes3 normal = cross(first, second);
-    const V8 area_sq = dot(normal, normal);
-    const I8 sound = area_sq > 1e-24 * dot(first, first) * dot(second, second);
-    const V8 scale = 1.0 / (sound ? area_sq : one), height = dot(offset, normal);
-    const V8 y = dot(cross(offset, second), normal) * scale, z = dot(cross(first, offset), normal) * scale;
-    const I8 inside = sound & (y >= zero) & (z >= zero) & (y + z <= one);
+    const VN area_sq = dot(normal, normal);
+    const IN sound = area_sq > 1e-24 * dot(first, first) * dot(second, second);
+    const VN scale = 1.0 / (sound ? area_sq : one), height = dot(offset, normal);
+    const VN y = dot(cross(offset, second), normal) * scale, z = dot(cross(first, offset), normal) * scale;
+    const IN inside = sound & (y >= zero) & (z >= zero) & (y + z <= one);
     return inside ? height * height * scale : best;
 }
 
 // The same of two segments.
-inline V8 segment_segment_sq(const Lanes3* x) {
-    const V8 zero = all(0.0), one = all(1.0);
+inline VN segment_segment_sq(const Lanes3* x) {
+    const VN zero = every(0.0), one = every(1.0);
     const Lanes3 u = x[1] - x[0], v = x[3] - x[2], w = x[0] - x[2];
-    const V8 best = less(less(segment_sq(w, v), segment_sq(x[1] - x[2], v)), less(segment_sq(x[2] - x[0], u), segment_sq(x[3] - x[0], u)));
-    const V8 uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), uw = dot(u, w), vw = dot(v, w), det = uu * vv - uv * uv;
-    const I8 sound = det > 1e-24 * uu * vv;
-    const V8 scale = 1.0 / (sound ? det : one), s = (uv * vw - vv * uw) * scale, t = (uu * vw - uv * uw) * scale;
-    const I8 inside = sound & (s >= zero) & (s <= one) & (t >= zero) & (t <= one);
+    const VN best = less(less(segment_sq(w, v), segment_sq(x[1] - x[2], v)), less(segment_sq(x[2] - x[0], u), segment_sq(x[3] - x[0], u)));
+    const VN uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), uw = dot(u, w), vw = dot(v, w), det = uu * vv - uv * uv;
+    const IN sound = det > 1e-24 * uu * vv;
+    const VN scale = 1.0 / (sound ? det : one), s = (uv * vw - vv * uw) * scale, t = (uu * vw - uv * uw) * scale;
+    const IN inside = sound & (s >= zero) & (s <= one) & (t >= zero) & (t <= one);
     const Lanes3 gap = {w.x + s * u.x - t * v.x, w.y + s * u.y - t * v.y, w.z + s * u.z - t * v.z};
     return inside ? dot(gap, gap) : best;
 }

@@ -236,7 +236,7 @@ struct Layers {
         if (overflowed) return;
         if (first) std::sort(released.begin(), released.end());
         for (int edges = 0; edges < 2; ++edges)
-            for (size_t i = 0; i < candidates[edges].count; i += LANES) measure(edges, i, stray);
+            for (size_t i = 0; i < candidates[edges].count; i += AT_ONCE) measure(edges, i, stray);
     }
 
     const int32_t* corners_at(int64_t place) const { return mesh.faces + 3 * (int64_t)mesh.order[place]; }
@@ -266,10 +266,10 @@ struct Layers {
     // features move towards each other from there and what they may be off their ways.
     void measure(int edges, size_t begin, const std::vector<uint8_t>* stray) {
         const std::vector<Candidate>& list = candidates[edges].list;
-        const int count = (int)std::min<size_t>(LANES, candidates[edges].count - begin), split = edges ? 2 : 1;
-        int32_t corner[LANES][4];
-        alignas(64) double middle[4][3][LANES], half[4][3][LANES];
-        for (int lane = 0; lane < LANES; ++lane) {
+        const int count = (int)std::min<size_t>(AT_ONCE, candidates[edges].count - begin), split = edges ? 2 : 1;
+        int32_t corner[AT_ONCE][4];
+        alignas(64) double middle[4][3][AT_ONCE], half[4][3][AT_ONCE];
+        for (int lane = 0; lane < AT_ONCE; ++lane) {
             corners_of(edges, list[begin + std::min(lane, count - 1)], corner[lane]);
             for (int c = 0; c < 4; ++c) {
                 const double *a = from.data() + 3 * (int64_t)corner[lane][c], *b = to.data() + 3 * (int64_t)corner[lane][c];
@@ -278,11 +278,11 @@ struct Layers {
         }
         Lanes3 x[4], p[4];
         for (int c = 0; c < 4; ++c) {
-            x[c] = {load<V8>(middle[c][0]), load<V8>(middle[c][1]), load<V8>(middle[c][2])};
-            p[c] = {load<V8>(half[c][0]), load<V8>(half[c][1]), load<V8>(half[c][2])};
+            x[c] = {load<VN>(middle[c][0]), load<VN>(middle[c][1]), load<VN>(middle[c][2])};
+            p[c] = {load<VN>(half[c][0]), load<VN>(half[c][1]), load<VN>(half[c][2])};
         }
-        const V8 square = edges ? segment_segment_sq(x) : point_triangle_sq(x);
-        V8 way[2] = {all(0.0), all(0.0)};
+        const VN square = edges ? segment_segment_sq(x) : point_triangle_sq(x);
+        VN way[2] = {every(0.0), every(0.0)};
         if (moving) {
             const Lanes3 mean = {0.25 * (p[0].x + p[1].x + p[2].x + p[3].x), 0.25 * (p[0].y + p[1].y + p[2].y + p[3].y),
                                  0.25 * (p[0].z + p[1].z + p[2].z + p[3].z)};

@@ -2,7 +2,7 @@
 //
 // Everything lives in arrays that the caller owns (hood/solver/compiled/newton.py), so nothing here allocates. Vertices are numbered anew:
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
-// numbers a row. Elements are taken eight at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
+// numbers a row. Elements are taken some at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
 // elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
 // matrix a row keeps its diagonal block, which comes first, and those of later columns. Loops over elements and rows are shared by
 // threads where the cloth is large enough: in parts, each with its own sums, which are then added in their order.
@@ -116,8 +116,8 @@ struct Engine {
 namespace {
 
 inline Range rows_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.parts); }
-inline Range faces_of(const Engine& e, int64_t part) { return range_of(e.num_faces, part, e.parts, LANES); }
-inline Range hinges_of(const Engine& e, int64_t part) { return range_of(e.num_hinges, part, e.parts, LANES); }
+inline Range faces_of(const Engine& e, int64_t part) { return range_of(e.num_faces, part, e.parts, AT_ONCE); }
+inline Range hinges_of(const Engine& e, int64_t part) { return range_of(e.num_hinges, part, e.parts, AT_ONCE); }
 
 // A number of every part, a line of the cache each; added in their order.
 template <class V> struct Sums {
@@ -143,11 +143,11 @@ template <class T> struct HingeRecord {
     T row[14];
 };
 
-inline Strain strain_of(const Engine& e, const double* pos, int64_t i, V8 (*f)[3]) {
-    V8 offset[2][3];
+inline Strain strain_of(const Engine& e, const double* pos, int64_t i, VN (*f)[3]) {
+    VN offset[2][3];
     offsets_of<3, 4>(pos, e.face_corners + i, e.num_faces, offset);
     for (int a = 0; a < 2; ++a) {
-        const V8 one = load<V8>(e.shape + (3 * a + 1) * e.num_faces + i), two = load<V8>(e.shape + (3 * a + 2) * e.num_faces + i);
+        const VN one = load<VN>(e.shape + (3 * a + 1) * e.num_faces + i), two = load<VN>(e.shape + (3 * a + 2) * e.num_faces + i);
         for (int k = 0; k < 3; ++k) f[a][k] = offset[0][k] * one + offset[1][k] * two;
     }
     return green_strain(f);
@@ -156,80 +156,80 @@ inline Strain strain_of(const Engine& e, const double* pos, int64_t i, V8 (*f)[3
 // What the step has added to strains.
 inline Strain since_start(const Engine& e, int64_t i, const Strain& g) {
     const double* before = e.face_before + i;
-    return {g.g00 - load<V8>(before), g.g01 - load<V8>(before + e.num_faces), g.g11 - load<V8>(before + 2 * e.num_faces)};
+    return {g.g00 - load<VN>(before), g.g01 - load<VN>(before + e.num_faces), g.g11 - load<VN>(before + 2 * e.num_faces)};
 }
 
-inline Isotropic isotropic_of(const Engine& e, int64_t i) { return {load<V8>(e.mu + i), load<V8>(e.lambda + i)}; }
+inline Isotropic isotropic_of(const Engine& e, int64_t i) { return {load<VN>(e.mu + i), load<VN>(e.lambda + i)}; }
 
 inline Weave weave_of(const Engine& e, int64_t i) {
     const double* roots = e.weave + i;
-    return {load<V8>(roots), load<V8>(roots + e.num_faces), load<V8>(roots + 2 * e.num_faces), load<V8>(roots + 3 * e.num_faces)};
+    return {load<VN>(roots), load<VN>(roots + e.num_faces), load<VN>(roots + 2 * e.num_faces), load<VN>(roots + 3 * e.num_faces)};
 }
 
 template <auto law_of> double face_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
-    for (int64_t i = range.begin; i < range.end; i += LANES) {
-        V8 f[2][3];
+    for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
+        VN f[2][3];
         const Strain g = strain_of(e, pos, i, f);
         const auto law = law_of(e, i);
-        sum += total(load<V8>(e.area + i) * density_of(law, g));
+        sum += total(load<VN>(e.area + i) * density_of(law, g));
         if (!e.face_rate) continue;
-        sum += total(load<V8>(e.area + i) * load<V8>(e.face_rate + i) * density_of(law, since_start(e, i, g)));
+        sum += total(load<VN>(e.area + i) * load<VN>(e.face_rate + i) * density_of(law, since_start(e, i, g)));
     }
     return sum;
 }
 
 template <class T> void face_models(const Engine& e, const double* pos, Range range) {
     FaceRecord<T>* records = (FaceRecord<T>*)e.face_model;
-    const V8 zero = all(0.0), one = all(1.0);
-    for (int64_t i = range.begin; i < range.end; i += LANES) {
-        V8 f[2][3];
+    const VN zero = every(0.0), one = every(1.0);
+    for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
+        VN f[2][3];
         const Strain g = strain_of(e, pos, i, f);
         const auto stress = [&](const auto& law) {
             Stress s = stress_of(law, g, one);
             if (e.face_rate) {
-                const Stress viscous = stress_of(law, since_start(e, i, g), load<V8>(e.face_rate + i));
+                const Stress viscous = stress_of(law, since_start(e, i, g), load<VN>(e.face_rate + i));
                 s.s00 += viscous.s00, s.s01 += viscous.s01, s.s11 += viscous.s11;
             }
             return s;
         };
-        const V8 area = load<V8>(e.area + i), stiffer = e.face_rate ? root(1.0 + load<V8>(e.face_rate + i)) : one;
-        const V8 bulk = load<V8>(e.bulk + i) * stiffer, soft = load<V8>(e.soft + i) * stiffer;
+        const VN area = load<VN>(e.area + i), stiffer = e.face_rate ? root(1.0 + load<VN>(e.face_rate + i)) : one;
+        const VN bulk = load<VN>(e.bulk + i) * stiffer, soft = load<VN>(e.soft + i) * stiffer;
         Weave weave;
         Stress s;
         if (e.weave) {
             weave = weave_of(e, i);
             s = stress(weave);
-            const V8 size = root(area) * stiffer;
+            const VN size = root(area) * stiffer;
             weave.first *= size, weave.coupled *= size, weave.second *= size, weave.turn *= size;
         } else {
             s = stress(isotropic_of(e, i));
         }
         // The positive part of the stress, from the eigenvalues of a 2 x 2 matrix.
-        const V8 mean = 0.5 * (s.s00 + s.s11), half = 0.5 * (s.s00 - s.s11), radius = root(half * half + s.s01 * s.s01);
-        const V8 most = mean + radius, least = mean - radius;
-        const V8 high = most > zero ? most : zero, low = least > zero ? least : zero;
-        const V8 centre = 0.5 * (high + low), slope = radius > zero ? 0.5 * (high - low) / (radius > zero ? radius : one) : zero;
-        const V8 t00 = centre + slope * half, t01 = slope * s.s01, t11 = centre - slope * half;
-        V8 b0[3], b1[3], pull0[3], pull1[3], ten0[3], ten1[3];
+        const VN mean = 0.5 * (s.s00 + s.s11), half = 0.5 * (s.s00 - s.s11), radius = root(half * half + s.s01 * s.s01);
+        const VN most = mean + radius, least = mean - radius;
+        const VN high = most > zero ? most : zero, low = least > zero ? least : zero;
+        const VN centre = 0.5 * (high + low), slope = radius > zero ? 0.5 * (high - low) / (radius > zero ? radius : one) : zero;
+        const VN t00 = centre + slope * half, t01 = slope * s.s01, t11 = centre - slope * half;
+        VN b0[3], b1[3], pull0[3], pull1[3], ten0[3], ten1[3];
         for (int c = 0; c < 3; ++c) {
-            b0[c] = load<V8>(e.shape + c * e.num_faces + i);
-            b1[c] = load<V8>(e.shape + (3 + c) * e.num_faces + i);
-            const V8 w0 = area * b0[c], w1 = area * b1[c];
+            b0[c] = load<VN>(e.shape + c * e.num_faces + i);
+            b1[c] = load<VN>(e.shape + (3 + c) * e.num_faces + i);
+            const VN w0 = area * b0[c], w1 = area * b1[c];
             pull0[c] = s.s00 * w0 + s.s01 * w1, pull1[c] = s.s01 * w0 + s.s11 * w1;
             ten0[c] = t00 * w0 + t01 * w1, ten1[c] = t01 * w0 + t11 * w1;
         }
         for (int c = 0; c < 3; ++c) {
             for (int k = 0; k < 3; ++k) {
-                const V8 force = pull0[c] * f[0][k] + pull1[c] * f[1][k];
-                const V8 along = b0[c] * f[0][k], across = b1[c] * f[1][k];
-                const V8 turned = b0[c] * f[1][k] + b1[c] * f[0][k];
-                V8 roots[3] = {bulk * (along + across), soft * (along - across), soft * turned};
+                const VN force = pull0[c] * f[0][k] + pull1[c] * f[1][k];
+                const VN along = b0[c] * f[0][k], across = b1[c] * f[1][k];
+                const VN turned = b0[c] * f[1][k] + b1[c] * f[0][k];
+                VN roots[3] = {bulk * (along + across), soft * (along - across), soft * turned};
                 if (e.weave) {
                     roots[0] = weave.first * along + weave.coupled * across;
                     roots[1] = weave.second * across, roots[2] = weave.turn * turned;
                 }
-                for (int lane = 0; lane < LANES; ++lane) {
+                for (int lane = 0; lane < AT_ONCE; ++lane) {
                     e.face_force[10 * (i + lane) + 3 * c + k] = force[lane];
                     for (int m = 0; m < 3; ++m) records[i + lane].root[9 * m + 3 * c + k] = (T)roots[m][lane];
                 }
@@ -238,8 +238,8 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
         int place = 0;
         for (int c = 0; c < 3; ++c)
             for (int d = c; d < 3; ++d, ++place) {
-                const V8 axial = ten0[c] * b0[d] + ten1[c] * b1[d], indefinite_part = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
-                for (int lane = 0; lane < LANES; ++lane) {
+                const VN axial = ten0[c] * b0[d] + ten1[c] * b1[d], indefinite_part = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
+                for (int lane = 0; lane < AT_ONCE; ++lane) {
                     records[i + lane].axial[2 * place] = (T)axial[lane];
                     records[i + lane].axial[2 * place + 1] = (T)indefinite_part[lane];
                 }
@@ -248,26 +248,26 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
 }
 
 // The hinge in units of its edge at rest; returns how many of them make a metre.
-inline V8 hinge_of(const Engine& e, const double* pos, int64_t i, V8 (*offset)[3], Hinge& h) {
+inline VN hinge_of(const Engine& e, const double* pos, int64_t i, VN (*offset)[3], Hinge& h) {
     offsets_of<4, 4>(pos, e.hinge_corners + i, e.num_hinges, offset);
-    const V8 per_unit = 1.0 / load<V8>(e.rest_length + i);
+    const VN per_unit = 1.0 / load<VN>(e.rest_length + i);
     hinge_of(offset, per_unit, h);
     return per_unit;
 }
 
 double hinge_energy(const Engine& e, const double* pos, Range range) {
     double sum = 0.0;
-    for (int64_t i = range.begin; i < range.end; i += LANES) {
+    for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
         Hinge h;
-        V8 offset[3][3];
-        const V8 per_unit = hinge_of(e, pos, i, offset, h), weight = load<V8>(e.hinge_weight + i);
+        VN offset[3][3];
+        const VN per_unit = hinge_of(e, pos, i, offset, h), weight = load<VN>(e.hinge_weight + i);
         if (e.bending == 2) {
             sum += total(bending_energy(weight, h.angle * per_unit) * dot(offset[0], offset[0]));
         } else {
-            sum += total(bending_energy(weight, bend_of(h.angle, load<V8>(e.rest_angle + i))));
+            sum += total(bending_energy(weight, bend_of(h.angle, load<VN>(e.rest_angle + i))));
             if (!e.hinge_rate) continue;
-            const V8 added = bend_of(h.angle, load<V8>(e.hinge_before + i));
-            sum += total(bending_energy(load<V8>(e.hinge_rate + i) * weight, added));
+            const VN added = bend_of(h.angle, load<VN>(e.hinge_before + i));
+            sum += total(bending_energy(load<VN>(e.hinge_rate + i) * weight, added));
         }
     }
     return sum;
@@ -275,36 +275,36 @@ double hinge_energy(const Engine& e, const double* pos, Range range) {
 
 template <class T> void hinge_models(const Engine& e, const double* pos, Range range) {
     HingeRecord<T>* records = (HingeRecord<T>*)e.hinge_model;
-    const V8 zero = all(0.0), one = all(1.0);
-    for (int64_t i = range.begin; i < range.end; i += LANES) {
+    const VN zero = every(0.0), one = every(1.0);
+    for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
         Hinge h;
-        V8 offset[3][3], slope[4][3];
-        const V8 per_unit = hinge_of(e, pos, i, offset, h), *edge = offset[0];
+        VN offset[3][3], slope[4][3];
+        const VN per_unit = hinge_of(e, pos, i, offset, h), *edge = offset[0];
         hinge_slopes(h, -h.length * per_unit, slope);
-        V8 residual;
+        VN residual;
         if (e.bending == 2) {
-            const V8 length = root(dot(edge, edge)), ratio = length * per_unit;
+            const VN length = root(dot(edge, edge)), ratio = length * per_unit;
             residual = h.angle * ratio;
-            const V8 along = h.angle * per_unit / (length > zero ? length : one);
+            const VN along = h.angle * per_unit / (length > zero ? length : one);
             for (int k = 0; k < 3; ++k) {
                 for (int c = 0; c < 4; ++c) slope[c][k] *= ratio;
                 slope[0][k] -= along * edge[k];
                 slope[1][k] += along * edge[k];
             }
         } else {
-            residual = bend_of(h.angle, load<V8>(e.rest_angle + i));
+            residual = bend_of(h.angle, load<VN>(e.rest_angle + i));
         }
-        const V8 weight = load<V8>(e.hinge_weight + i);
-        V8 force = weight * residual, size = root(weight);
+        const VN weight = load<VN>(e.hinge_weight + i);
+        VN force = weight * residual, size = root(weight);
         if (e.hinge_rate) {
-            const V8 rate = load<V8>(e.hinge_rate + i);
-            force += rate * weight * bend_of(h.angle, load<V8>(e.hinge_before + i));
+            const VN rate = load<VN>(e.hinge_rate + i);
+            force += rate * weight * bend_of(h.angle, load<VN>(e.hinge_before + i));
             size *= root(1.0 + rate);
         }
         for (int c = 0; c < 4; ++c)
             for (int k = 0; k < 3; ++k) {
-                const V8 pull = force * slope[c][k], row = size * slope[c][k];
-                for (int lane = 0; lane < LANES; ++lane) {
+                const VN pull = force * slope[c][k], row = size * slope[c][k];
+                for (int lane = 0; lane < AT_ONCE; ++lane) {
                     e.hinge_force[14 * (i + lane) + 3 * c + k] = pull[lane];
                     records[i + lane].row[3 * c + k] = (T)row[lane];
                 }

@@ -24,30 +24,39 @@ constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
 constexpr double NONE = 1e300;  // the number of no face and of no vertex
 
 typedef float F8 __attribute__((vector_size(32)));
+typedef float FN __attribute__((vector_size(4 * AT_ONCE)));
 
 // The second where one is not a number.
 template <class V> inline V least(V a, V b) { return a < b ? a : b; }
 template <class V> inline V greatest(V a, V b) { return a > b ? a : b; }
 
-inline double least_lane(V8 v) {
-    alignas(64) double lane[WIDE];
+inline double least_lane(VN v) {
+    alignas(sizeof(VN)) double lane[AT_ONCE];
     store(lane, v);
-    double low[4];
-    for (int i = 0; i < 4; ++i) low[i] = lane[i + 4] < lane[i] ? lane[i + 4] : lane[i];
-    for (int i = 0; i < 2; ++i) low[i] = low[i + 2] < low[i] ? low[i + 2] : low[i];
-    return low[1] < low[0] ? low[1] : low[0];
+    double low[AT_ONCE];
+    for (int i = 0; i < AT_ONCE / 2; ++i) low[i] = lane[i + AT_ONCE / 2] < lane[i] ? lane[i + AT_ONCE / 2] : lane[i];
+    for (int half = AT_ONCE / 4; half; half /= 2)
+        for (int i = 0; i < half; ++i) low[i] = low[i + half] < low[i] ? low[i + half] : low[i];
+    return low[0];
+}
+
+// The least of what is made for every part of eight lanes, beginning at its number.
+template <class Part> inline double least_of(const Part& part) {
+    VN low = part(0);
+    for (int i = AT_ONCE; i < WIDE; i += AT_ONCE) low = least(part(i), low);
+    return least_lane(low);
 }
 
 inline void put(double* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 inline double clamp(double v) { return v < 0.0 ? 0.0 : v > 1.0 ? 1.0 : v; }
 
 struct Axes {
-    V8 x, y, z;
+    VN x, y, z;
 };
 inline Axes operator-(Axes a, Axes b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline V8 dot(Axes a, Axes b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Axes along(Axes a, V8 s, Axes b) { return {a.x - s * b.x, a.y - s * b.y, a.z - s * b.z}; }
-inline Axes load_axes(const double* p) { return {load<V8>(p), load<V8>(p + WIDE), load<V8>(p + 2 * WIDE)}; }
+inline VN dot(Axes a, Axes b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Axes along(Axes a, VN s, Axes b) { return {a.x - s * b.x, a.y - s * b.y, a.z - s * b.z}; }
+inline Axes load_axes(const double* p) { return {load<VN>(p), load<VN>(p + WIDE), load<VN>(p + 2 * WIDE)}; }
 
 }  // namespace
 
@@ -150,17 +159,17 @@ void closest_on_triangle(Vec p, Vec a, Vec b, Vec c, double* bary, Vec* offset) 
     }
 }
 
-inline V8 share(V8 value, V8 size) {
-    return least(greatest(value / greatest(size, all(TINY)), all(0.0)), all(1.0));
+inline VN share(VN value, VN size) {
+    return least(greatest(value / greatest(size, every(TINY)), every(0.0)), every(1.0));
 }
 
-// Squared distances from q, relative to the first corner, to eight triangles: what closest_on_triangle finds.
-inline V8 triangle_dist_sq(Axes q, Axes u, Axes v) {
-    const V8 zero = all(0.0), one = all(1.0), uu = dot(u, u), vv = dot(v, v), uv = dot(u, v), pu = dot(q, u), pv = dot(q, v);
-    const V8 det = uu * vv - uv * uv;
-    const I8 regular = det > EPS * uu * vv;
-    const V8 safe = regular ? det : one, s = (vv * pu - uv * pv) / safe, t = (uu * pv - uv * pu) / safe;
-    const I8 inside = regular & (s >= zero) & (t >= zero) & (s + t <= one);
+// Squared distances from q, relative to the first corner, to triangles: what closest_on_triangle finds.
+inline VN triangle_dist_sq(Axes q, Axes u, Axes v) {
+    const VN zero = every(0.0), one = every(1.0), uu = dot(u, u), vv = dot(v, v), uv = dot(u, v), pu = dot(q, u), pv = dot(q, v);
+    const VN det = uu * vv - uv * uv;
+    const IN regular = det > EPS * uu * vv;
+    const VN safe = regular ? det : one, s = (vv * pu - uv * pv) / safe, t = (uu * pv - uv * pu) / safe;
+    const IN inside = regular & (s >= zero) & (t >= zero) & (s + t <= one);
     const Axes w = v - u, r = q - u, free = along(along(q, s, u), t, v);
     const Axes by_u = along(q, share(pu, uu), u), by_v = along(q, share(pv, vv), v), by_w = along(r, share(dot(r, w), dot(w, w)), w);
     return inside ? dot(free, free) : least(dot(by_u, by_u), least(dot(by_v, by_v), dot(by_w, by_w)));
@@ -168,10 +177,10 @@ inline V8 triangle_dist_sq(Axes q, Axes u, Axes v) {
 
 // The least distance in each lane, and whose it is.
 struct Least {
-    V8 dist_sq = all(INFINITY), number = all(NONE);
+    VN dist_sq = every(INFINITY), number = every(NONE);
 
-    void take(V8 other_dist_sq, V8 other_number) {
-        const I8 better = (other_dist_sq < dist_sq) | ((other_dist_sq == dist_sq) & (other_number < number));
+    void take(VN other_dist_sq, VN other_number) {
+        const IN better = (other_dist_sq < dist_sq) | ((other_dist_sq == dist_sq) & (other_number < number));
         dist_sq = better ? other_dist_sq : dist_sq;
         number = better ? other_number : number;
     }
@@ -182,9 +191,9 @@ struct Found {
 };
 
 inline Found first_of(const Least& least) {
-    alignas(64) double dist_sq[WIDE], number[WIDE];
+    alignas(sizeof(VN)) double dist_sq[AT_ONCE], number[AT_ONCE];
     store(dist_sq, least.dist_sq), store(number, least.number);
-    for (int half = WIDE / 2; half; half /= 2)
+    for (int half = AT_ONCE / 2; half; half /= 2)
         for (int i = 0; i < half; ++i) {
             const double d = dist_sq[i + half], n = number[i + half];
             const bool better = (d < dist_sq[i]) | ((d == dist_sq[i]) & (n < number[i]));
@@ -193,24 +202,27 @@ inline Found first_of(const Least& least) {
     return {dist_sq[0], number[0]};
 }
 
-inline Axes everywhere(Vec p) { return {all(p.x), all(p.y), all(p.z)}; }
+inline Axes everywhere(Vec p) { return {every(p.x), every(p.y), every(p.z)}; }
 
 inline void try_faces(const Tree& tree, Vec point, int64_t leaf, Least& best) {
     const Axes p = everywhere(point);
-    const double* table = tree.corners + 9 * WIDE * leaf;
-    const Axes a = load_axes(table), b = load_axes(table + 3 * WIDE), c = load_axes(table + 6 * WIDE);
-    best.take(triangle_dist_sq(p - a, b - a, c - a), load<V8>(tree.number + WIDE * leaf));
+    for (int i = 0; i < WIDE; i += AT_ONCE) {
+        const double* table = tree.corners + 9 * WIDE * leaf + i;
+        const Axes a = load_axes(table), b = load_axes(table + 3 * WIDE), c = load_axes(table + 6 * WIDE);
+        best.take(triangle_dist_sq(p - a, b - a, c - a), load<VN>(tree.number + WIDE * leaf + i));
+    }
 }
 
 inline void try_vertices(const Tree& tree, Vec point, int64_t leaf, Least& best) {
     const Axes p = everywhere(point);
-    for (int64_t block = tree.block_first[leaf]; block < tree.block_first[leaf + 1]; ++block) {
-        const Axes gap = p - load_axes(tree.block_pos + 3 * WIDE * block);
-        best.take(dot(gap, gap), load<V8>(tree.block_number + WIDE * block));
-    }
+    for (int64_t block = tree.block_first[leaf]; block < tree.block_first[leaf + 1]; ++block)
+        for (int i = 0; i < WIDE; i += AT_ONCE) {
+            const Axes gap = p - load_axes(tree.block_pos + 3 * WIDE * block + i);
+            best.take(dot(gap, gap), load<VN>(tree.block_number + WIDE * block + i));
+        }
 }
 
-// Squared distances to eight boxes; not a number where there is no box.
+// Squared distances to boxes; not a number where there is no box.
 template <class V, class T> inline V box_dist_sq(const T* box, T x, T y, T z) {
     const V zero{};
     const V dx = greatest(zero, greatest(load<V>(box) - x, x - load<V>(box + 3 * WIDE)));
@@ -243,13 +255,19 @@ inline void walk_from(Walk& walk, const Tree& tree, Vec p) {
     walk.parent = -1;
 }
 
-inline V8 children_dist_sq(const Tree& tree, int64_t node, Vec p) { return box_dist_sq<V8>(tree.boxes + 6 * WIDE * node, p.x, p.y, p.z); }
+// To the children of a node from the i-th on.
+inline VN children_dist_sq(const Tree& tree, int64_t node, Vec p, int i) {
+    return box_dist_sq<VN>(tree.boxes + 6 * WIDE * node + i, p.x, p.y, p.z);
+}
 
 // On to the child that looks nearest; positive doubles are ordered as integers are, and the last three bits hold the lane.
 inline void go_down(const Tree& tree, Walk& walk) {
     alignas(64) int64_t key[WIDE];
-    const V8 away = children_dist_sq(tree, walk.node, walk.p);
-    store(key, ((I8)away & ~(INT64_MIN | 7)) | I8{0, 1, 2, 3, 4, 5, 6, 7});
+    for (int i = 0; i < WIDE; i += AT_ONCE) {
+        IN number;
+        for (int lane = 0; lane < AT_ONCE; ++lane) number[lane] = i + lane;
+        store(key + i, ((IN)children_dist_sq(tree, walk.node, walk.p, i) & ~(INT64_MIN | 7)) | number);
+    }
     for (int half = WIDE / 2; half; half /= 2)
         for (int i = 0; i < half; ++i) key[i] = std::min(key[i], key[i + half]);
     walk.parent = walk.node;
@@ -259,7 +277,7 @@ inline void go_down(const Tree& tree, Walk& walk) {
 // Lists the children of a node whose boxes are within the limit, but for one: nodes to visit, and leaves with their distances.
 inline void list_children(const Tree& tree, const Walk& walk, int32_t number, int64_t node, int64_t except, int64_t& nodes, int64_t& leaves) {
     alignas(64) double away[WIDE];
-    store(away, children_dist_sq(tree, node, walk.p));
+    for (int i = 0; i < WIDE; i += AT_ONCE) store(away + i, children_dist_sq(tree, node, walk.p, i));
     const int32_t* child = tree.children + WIDE * node;
     Visit *const to_nodes = tree.nodes, *const to_leaves = tree.leaves;
     double* const reach = tree.reach;
@@ -391,13 +409,13 @@ Vec pseudonormal(const Tree& tree, int64_t face, const double* bary) {
     return sum;
 }
 
-// Eight vertices and the faces around them.
+// Vertices, one a lane, and the faces around them.
 struct Fans {
-    int32_t vertex[WIDE], first[WIDE], size[WIDE], turns = 0;
+    int32_t vertex[AT_ONCE], first[AT_ONCE], size[AT_ONCE], turns = 0;
 
     // The needed vertices from the i-th on; the last one is repeated.
     Fans(const Tree& tree, int64_t i, int64_t count) {
-        for (int lane = 0; lane < WIDE; ++lane) {
+        for (int lane = 0; lane < AT_ONCE; ++lane) {
             const int32_t v = vertex[lane] = tree.needed[std::min(i + lane, count - 1)];
             first[lane] = tree.fan_first[v], size[lane] = tree.fan_first[v + 1] - first[lane];
             turns = std::max(turns, size[lane]);
@@ -406,25 +424,25 @@ struct Fans {
 
     // The corners whose turn it is, and what they count; vertices themselves, and nothing, where there are no more.
     void turn(const Tree& tree, int32_t k, int32_t* corner) const {
-        for (int lane = 0; lane < WIDE; ++lane) corner[lane] = k < size[lane] ? tree.fan[first[lane] + k] : vertex[lane];
+        for (int lane = 0; lane < AT_ONCE; ++lane) corner[lane] = k < size[lane] ? tree.fan[first[lane] + k] : vertex[lane];
     }
-    V8 share(const Tree& tree, int32_t k) const {
-        return lanes([&](int lane) { return k < size[lane] ? tree.fan_share[first[lane] + k] : 0.0; });
+    VN share(const Tree& tree, int32_t k) const {
+        return gather([&](int lane) { return k < size[lane] ? tree.fan_share[first[lane] + k] : 0.0; });
     }
 };
 
 // Rows of a table, which are so far apart.
 inline Axes pick(const double* table, int64_t stride, const int32_t* row) {
-    const double* at[WIDE];
-    for (int lane = 0; lane < WIDE; ++lane) at[lane] = table + stride * row[lane];
-    return {lanes([&](int lane) { return at[lane][0]; }), lanes([&](int lane) { return at[lane][1]; }),
-            lanes([&](int lane) { return at[lane][2]; })};
+    const double* at[AT_ONCE];
+    for (int lane = 0; lane < AT_ONCE; ++lane) at[lane] = table + stride * row[lane];
+    return {gather([&](int lane) { return at[lane][0]; }), gather([&](int lane) { return at[lane][1]; }),
+            gather([&](int lane) { return at[lane][2]; })};
 }
 
 inline void put(double* table, int64_t stride, const int32_t* row, Axes a) {
-    alignas(64) double axes[3][WIDE];
+    alignas(sizeof(VN)) double axes[3][AT_ONCE];
     store(axes[0], a.x), store(axes[1], a.y), store(axes[2], a.z);
-    for (int lane = 0; lane < WIDE; ++lane)
+    for (int lane = 0; lane < AT_ONCE; ++lane)
         for (int k = 0; k < 3; ++k) table[stride * row[lane] + k] = axes[k][lane];
 }
 
@@ -433,19 +451,19 @@ inline void add_cross(Axes a, Axes b, Axes& sum) {
 }
 
 inline Axes unit(Axes a) {
-    const V8 length = root(dot(a, a)), zero = all(0.0);
-    const I8 some = length > TINY;
-    const V8 scale = 1.0 / (some ? length : all(1.0));
+    const VN length = root(dot(a, a)), zero = every(0.0);
+    const IN some = length > TINY;
+    const VN scale = 1.0 / (some ? length : every(1.0));
     return {some ? scale * a.x : zero, some ? scale * a.y : zero, some ? scale * a.z : zero};
 }
 
 // Area-weighted unit normals now and, of as many places, next; zero where there is none.
 void make_normals(const Tree& tree, const Fans& fans, const double* const* pos, int places) {
-    const Axes nothing{all(0.0), all(0.0), all(0.0)};
+    const Axes nothing{every(0.0), every(0.0), every(0.0)};
     Axes here[2] = {nothing, nothing}, before[2] = {nothing, nothing}, sum[2] = {nothing, nothing};
     for (int p = 0; p < places; ++p) here[p] = pick(pos[p], 3, fans.vertex);
     for (int32_t k = 0; k < fans.turns; ++k) {
-        int32_t corner[WIDE];
+        int32_t corner[AT_ONCE];
         fans.turn(tree, k, corner);
         for (int p = 0; p < places; ++p) {
             const Axes edge = pick(pos[p], 3, corner) - here[p];
@@ -457,34 +475,34 @@ void make_normals(const Tree& tree, const Fans& fans, const double* const* pos, 
 }
 
 // Largest normal curvatures over the edges at vertices, see hood/mesh/geometry.py.
-V8 bend(const Tree& tree, const Query& query, const Fans& fans) {
+VN bend(const Tree& tree, const Query& query, const Fans& fans) {
     const Axes here = pick(tree.pos, 3, fans.vertex), normal = pick(tree.vertex_normal, 6, fans.vertex);
-    V8 most = all(0.0);
+    VN most = every(0.0);
     for (int32_t k = 0; k < fans.turns; ++k) {
-        int32_t corner[WIDE];
+        int32_t corner[AT_ONCE];
         fans.turn(tree, k, corner);
         const Axes edge = pick(tree.pos, 3, corner) - here, turn = pick(tree.vertex_normal, 6, corner) - normal;
-        most = greatest(dot(turn, edge) / greatest(dot(edge, edge), all(TINY)), most);
+        most = greatest(dot(turn, edge) / greatest(dot(edge, edge), every(TINY)), most);
     }
-    return least(most, all(query.most_curvature));
+    return least(most, every(query.most_curvature));
 }
 
 // The average over the corners of the faces around vertices, each face with the vertex itself.
-V8 average(const Tree& tree, const double* values, const Fans& fans) {
-    V8 sum = lanes([&](int lane) { return values[fans.vertex[lane]]; }) / 3.0;
+VN average(const Tree& tree, const double* values, const Fans& fans) {
+    VN sum = gather([&](int lane) { return values[fans.vertex[lane]]; }) / 3.0;
     for (int32_t k = 0; k < fans.turns; ++k) {
-        int32_t corner[WIDE];
+        int32_t corner[AT_ONCE];
         fans.turn(tree, k, corner);
-        sum += fans.share(tree, k) * lanes([&](int lane) { return values[corner[lane]]; });
+        sum += fans.share(tree, k) * gather([&](int lane) { return values[corner[lane]]; });
     }
     return sum;
 }
 
-// Work on the needed vertices ``begin`` to ``end``, eight at a time, by threads.
+// Work on the needed vertices ``begin`` to ``end``, some at a time, by threads.
 template <class Work> void for_needed(const Tree& tree, int64_t begin, int64_t end, const Work& work) {
     for_parts(tree.parts, [&](int64_t part) {
-        const Range range = range_of(end - begin, part, tree.parts, WIDE);
-        for (int64_t i = begin + range.begin; i < begin + range.end; i += WIDE) work(Fans(tree, i, end));
+        const Range range = range_of(end - begin, part, tree.parts, AT_ONCE);
+        for (int64_t i = begin + range.begin; i < begin + range.end; i += AT_ONCE) work(Fans(tree, i, end));
     });
 }
 
@@ -516,9 +534,9 @@ const double* make_curvatures(const Tree& tree, const Query& query, const std::v
     double *now = tree.bulge, *other = now + tree.num_vertices;
     const auto fill = [&](int64_t ring, double* values, const auto& values_at) {
         for_needed(tree, 0, until[ring], [&](const Fans& fans) {
-            alignas(64) double value[WIDE];
+            alignas(sizeof(VN)) double value[AT_ONCE];
             store(value, values_at(fans));
-            for (int lane = 0; lane < WIDE; ++lane) values[fans.vertex[lane]] = value[lane];
+            for (int lane = 0; lane < AT_ONCE; ++lane) values[fans.vertex[lane]] = value[lane];
         });
     };
     fill(query.rounds, now, [&](const Fans& fans) { return bend(tree, query, fans); });
@@ -561,15 +579,18 @@ void describe(const Tree& tree, const Query& query) {
 
 // Unit normals of the faces of a leaf; what is around all of them goes to the lane of its node.
 void fit_normals(const Tree& tree, int64_t leaf, double* side) {
-    const double* table = tree.corners + 9 * WIDE * leaf;
-    const Axes a = load_axes(table), u = load_axes(table + 3 * WIDE) - a, v = load_axes(table + 6 * WIDE) - a;
-    Axes normal{all(0.0), all(0.0), all(0.0)};
-    add_cross(u, v, normal);
-    normal = unit(normal);
-    const V8 axes[3] = {normal.x, normal.y, normal.z};
+    double* normals = tree.leaf_normals + 3 * WIDE * leaf;
+    for (int i = 0; i < WIDE; i += AT_ONCE) {
+        const double* table = tree.corners + 9 * WIDE * leaf + i;
+        const Axes a = load_axes(table), u = load_axes(table + 3 * WIDE) - a, v = load_axes(table + 6 * WIDE) - a;
+        Axes normal = everywhere({0.0, 0.0, 0.0});
+        add_cross(u, v, normal);
+        normal = unit(normal);
+        store(normals + i, normal.x), store(normals + WIDE + i, normal.y), store(normals + 2 * WIDE + i, normal.z);
+    }
     for (int k = 0; k < 3; ++k) {
-        store(tree.leaf_normals + WIDE * (3 * leaf + k), axes[k]);
-        side[WIDE * k] = least_lane(axes[k]), side[WIDE * (3 + k)] = -least_lane(-axes[k]);
+        side[WIDE * k] = least_of([&](int i) { return load<VN>(normals + WIDE * k + i); });
+        side[WIDE * (3 + k)] = -least_of([&](int i) { return -load<VN>(normals + WIDE * k + i); });
     }
 }
 
@@ -588,23 +609,26 @@ void fit_all_normals(Tree& tree) {
                 continue;
             }
             for (int k = 0; k < 6; ++k) {
-                const V8 below = load<V8>(tree.normal_boxes + WIDE * (6 * child + k));
-                side[WIDE * k] = child == node ? NAN : k < 3 ? least_lane(below) : -least_lane(-below);
+                const double* below = tree.normal_boxes + WIDE * (6 * child + k);
+                side[WIDE * k] = child == node ? NAN
+                                 : k < 3       ? least_of([&](int j) { return load<VN>(below + j); })
+                                               : -least_of([&](int j) { return -load<VN>(below + j); });
             }
         }
 }
 
 // Lanes whose least product of a normal with n is below a limit; none where there is no box.
-inline I8 may_turn(const double* box, Vec n, double limit) {
-    const V8 x = least(load<V8>(box) * n.x, load<V8>(box + 3 * WIDE) * n.x);
-    const V8 y = least(load<V8>(box + WIDE) * n.y, load<V8>(box + 4 * WIDE) * n.y);
-    const V8 z = least(load<V8>(box + 2 * WIDE) * n.z, load<V8>(box + 5 * WIDE) * n.z);
+inline IN may_turn(const double* box, Vec n, double limit) {
+    const VN x = least(load<VN>(box) * n.x, load<VN>(box + 3 * WIDE) * n.x);
+    const VN y = least(load<VN>(box + WIDE) * n.y, load<VN>(box + 4 * WIDE) * n.y);
+    const VN z = least(load<VN>(box + 2 * WIDE) * n.z, load<VN>(box + 5 * WIDE) * n.z);
     return x + y + z < limit;
 }
 
-inline unsigned bits_of(I8 lanes_set) {
+// A bit for every one of eight lanes that is set, by parts that begin at a number.
+template <class Part> inline unsigned bits_of(const Part& part) {
     alignas(64) int64_t lane[WIDE];
-    store(lane, lanes_set);
+    for (int i = 0; i < WIDE; i += AT_ONCE) store(lane + i, part(i));
     unsigned bits = 0;
     for (int i = 0; i < WIDE; ++i) bits |= (unsigned)(lane[i] != 0) << i;
     return bits;
@@ -616,8 +640,8 @@ bool leaf_turns(const Tree& tree, int64_t leaf, Vec p, float limit, Vec n, doubl
     const F8 away = box_dist_sq<F8>(tree.face_boxes + 6 * WIDE * leaf, (float)local.x, (float)local.y, (float)local.z);
     alignas(32) float lane[WIDE];
     store(lane, away);
-    const Axes normal = load_axes(tree.leaf_normals + 3 * WIDE * leaf);
-    unsigned turned = bits_of(dot(normal, everywhere(n)) < cosine);
+    const double* normals = tree.leaf_normals + 3 * WIDE * leaf;
+    unsigned turned = bits_of([&](int i) { return dot(load_axes(normals + i), everywhere(n)) < cosine; });
     for (; turned; turned &= turned - 1)
         if (lane[__builtin_ctz(turned)] <= limit) return true;
     return false;
@@ -631,7 +655,8 @@ bool turns_near(const Tree& tree, Vec p, double dist_sq, Vec n, double cosine, s
     for (stack.assign(1, 0); !stack.empty();) {
         const int64_t node = stack.back();
         stack.pop_back();
-        unsigned within = bits_of((children_dist_sq(tree, node, p) <= limit) & may_turn(tree.normal_boxes + 6 * WIDE * node, n, cosine));
+        const double* normals = tree.normal_boxes + 6 * WIDE * node;
+        unsigned within = bits_of([&](int i) { return (children_dist_sq(tree, node, p, i) <= limit) & may_turn(normals + i, n, cosine); });
         for (; within; within &= within - 1) {
             const int64_t child = tree.children[WIDE * node + __builtin_ctz(within)];
             if (child >= 0)
@@ -789,14 +814,15 @@ void list_fan(Tree& tree, int64_t vertex, std::vector<std::array<int32_t, 2>>& l
 }
 
 // Widens the box from low to high, lane by lane; passes over what is not a number.
-inline void widen(V8 value, V8& low, V8& high) { low = least(value, low), high = greatest(value, high); }
+inline void widen(VN value, VN& low, VN& high) { low = least(value, low), high = greatest(value, high); }
 
 // Middle and size of everything.
 void locate(Tree& tree) {
     tree.size_sq = 0.0;
     for (int k = 0; k < 3; ++k) {
-        V8 low = all(INFINITY), high = all(-INFINITY);
-        for (int64_t block = 0; block < tree.num_blocks; ++block) widen(load<V8>(tree.block_pos + WIDE * (3 * block + k)), low, high);
+        VN low = every(INFINITY), high = every(-INFINITY);
+        for (int64_t block = 0; block < tree.num_blocks; ++block)
+            for (int i = 0; i < WIDE; i += AT_ONCE) widen(load<VN>(tree.block_pos + WIDE * (3 * block + k) + i), low, high);
         const double begin = least_lane(low), end = -least_lane(-high), middle = 0.5 * (begin + end);
         tree.origin[k] = std::isfinite(middle) ? middle : 0.0;
         tree.size_sq += (end - begin) * (end - begin);
@@ -806,11 +832,15 @@ void locate(Tree& tree) {
 // Boxes of the faces of a leaf; what is around all of them goes to the lane of its node.
 inline void fit_leaf(Tree& tree, int64_t leaf, double* side) {
     for (int k = 0; k < 3; ++k) {
-        V8 low = all(INFINITY), high = all(-INFINITY);
-        for (int c = 0; c < 3; ++c) widen(load<V8>(tree.corners + WIDE * (9 * leaf + 3 * c + k)), low, high);
-        float* box = tree.face_boxes + WIDE * (6 * leaf + k);
-        store(box, __builtin_convertvector(low - tree.origin[k], F8));
-        store(box + 3 * WIDE, __builtin_convertvector(high - tree.origin[k], F8));
+        VN low = every(INFINITY), high = every(-INFINITY);
+        for (int i = 0; i < WIDE; i += AT_ONCE) {
+            VN lowest = every(INFINITY), highest = every(-INFINITY);
+            for (int c = 0; c < 3; ++c) widen(load<VN>(tree.corners + WIDE * (9 * leaf + 3 * c + k) + i), lowest, highest);
+            float* box = tree.face_boxes + WIDE * (6 * leaf + k) + i;
+            store(box, __builtin_convertvector(lowest - tree.origin[k], FN));
+            store(box + 3 * WIDE, __builtin_convertvector(highest - tree.origin[k], FN));
+            low = least(lowest, low), high = greatest(highest, high);
+        }
         side[WIDE * k] = least_lane(low), side[WIDE * (3 + k)] = -least_lane(-high);
     }
 }
@@ -826,8 +856,9 @@ void fit_boxes(Tree& tree) {
                 continue;
             }
             for (int k = 0; k < 3; ++k) {
-                V8 low = all(INFINITY), high = all(-INFINITY);
-                for (int c = 0; c < 2; ++c) widen(load<V8>(tree.boxes + WIDE * (6 * child + 3 * c + k)), low, high);
+                VN low = every(INFINITY), high = every(-INFINITY);
+                for (int c = 0; c < 2; ++c)
+                    for (int j = 0; j < WIDE; j += AT_ONCE) widen(load<VN>(tree.boxes + WIDE * (6 * child + 3 * c + k) + j), low, high);
                 side[WIDE * k] = child == node ? NAN : least_lane(low);
                 side[WIDE * (3 + k)] = child == node ? NAN : -least_lane(-high);
             }

@@ -36,34 +36,36 @@ WITH_FORCE = {
 #: Calls of the laws of elements, of rows of eight numbers.
 ELEMENTS = """
 template <int IN, int OUT, class Law> void call(const double* in, double* out, const Law& law) {
-    V8 x[IN], y[OUT];
-    for (int k = 0; k < IN; ++k) x[k] = load<V8>(in + LANES * k);
-    law(x, y);
-    for (int k = 0; k < OUT; ++k) store(out + LANES * k, y[k]);
+    for (int i = 0; i < LANES; i += AT_ONCE) {
+        VN x[IN], y[OUT];
+        for (int k = 0; k < IN; ++k) x[k] = load<VN>(in + LANES * k + i);
+        law(x, y);
+        for (int k = 0; k < OUT; ++k) store(out + LANES * k + i, y[k]);
+    }
 }
-template <class Law> void respond(const Law& law, const V8* x, V8* y) {
+template <class Law> void respond(const Law& law, const VN* x, VN* y) {
     const Strain g{x[0], x[1], x[2]};
     const Stress s = stress_of(law, g, x[3]);
     y[0] = density_of(law, g), y[1] = s.s00, y[2] = s.s01, y[3] = s.s11;
 }
 extern "C" {
 void _strain(const double* in, double* out) {
-    call<6, 3>(in, out, [](const V8* x, V8* y) {
-        V8 f[2][3];
+    call<6, 3>(in, out, [](const VN* x, VN* y) {
+        VN f[2][3];
         for (int k = 0; k < 6; ++k) f[k / 3][k % 3] = x[k];
         const Strain g = green_strain(f);
         y[0] = g.g00, y[1] = g.g01, y[2] = g.g11;
     });
 }
 void _isotropic(const double* in, double* out) {
-    call<6, 4>(in, out, [](const V8* x, V8* y) { respond(Isotropic{x[4], x[5]}, x, y); });
+    call<6, 4>(in, out, [](const VN* x, VN* y) { respond(Isotropic{x[4], x[5]}, x, y); });
 }
 void _weave(const double* in, double* out) {
-    call<8, 4>(in, out, [](const V8* x, V8* y) { respond(Weave{x[4], x[5], x[6], x[7]}, x, y); });
+    call<8, 4>(in, out, [](const VN* x, VN* y) { respond(Weave{x[4], x[5], x[6], x[7]}, x, y); });
 }
 void _hinge(const double* in, double* out) {
-    call<11, 14>(in, out, [](const V8* x, V8* y) {
-        V8 offset[3][3], slope[4][3];
+    call<11, 14>(in, out, [](const VN* x, VN* y) {
+        VN offset[3][3], slope[4][3];
         for (int k = 0; k < 9; ++k) offset[k / 3][k % 3] = x[k];
         Hinge h;
         hinge_of(offset, x[9], h);
