@@ -5,18 +5,13 @@
 #include <cstdint>
 #include <cstring>
 
+#include "registers.h"
+
 namespace {
 
 typedef float F4 __attribute__((vector_size(16)));
 
-// Numbers that are compressed at a time.
-#if defined(__AVX512F__)
-constexpr int LANES = 16;
-#elif defined(__AVX__)
-constexpr int LANES = 8;
-#else
-constexpr int LANES = 4;
-#endif
+constexpr int LANES = REGISTER / 4;  // numbers that are compressed at a time
 typedef float V __attribute__((vector_size(4 * LANES)));
 typedef int32_t I __attribute__((vector_size(4 * LANES)));
 

@@ -3,20 +3,19 @@
 #include <cstdint>
 #include <cstring>
 
+#include "registers.h"
+
 #if defined(__AVX__)
 #include <immintrin.h>
 #endif
 
 namespace {
 
-#if defined(__AVX512F__)
-constexpr int LANES = 16, SUMS = 24;  // numbers in a vector, and sums that are in registers at a time
-#elif defined(__AVX__)
-constexpr int LANES = 8, SUMS = 12;
-#elif defined(__aarch64__)
-constexpr int LANES = 4, SUMS = 24;
+constexpr int LANES = REGISTER / 4;  // numbers in a vector
+#if defined(__AVX512F__) || defined(__aarch64__)
+constexpr int SUMS = 24;  // that are in registers at a time
 #else
-constexpr int LANES = 4, SUMS = 12;
+constexpr int SUMS = 12;
 #endif
 
 typedef float V __attribute__((vector_size(4 * LANES)));

@@ -5,16 +5,12 @@
 #include <cstdint>
 #include <cstring>
 
+#include "registers.h"
+
 namespace {
 
 constexpr int LANES = 8;
-#if defined(__AVX512F__)
-constexpr int AT_ONCE = 8;  // divides the eight to which tables of elements are padded
-#elif defined(__AVX__)
-constexpr int AT_ONCE = 4;
-#else
-constexpr int AT_ONCE = 2;
-#endif
+constexpr int AT_ONCE = REGISTER / 8;  // divides the eight to which tables of elements are padded
 
 typedef double VN __attribute__((vector_size(8 * AT_ONCE)));
 typedef decltype(VN{} < VN{}) IN;
