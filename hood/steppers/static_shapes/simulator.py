@@ -314,6 +314,7 @@ class _Plan:
         settled = None if potential is None else settled_potential(potential, problem)
         run: Run = FixedStep(simulator, self.layout, problem, dense=mode == "compiled", potential=settled)
         if mode != "fixed":
+            run(*memory)  # what is computed once per cloth is computed now: a trace has no values for it
             run = trace(run, memory)
         if mode == "compiled":
             run = torch.compile(run, fullgraph=True, dynamic=False)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
@@ -165,6 +165,21 @@ def test_a_batch(tank_scene: Scene, skirt_scene: Scene) -> None:
     steps = concatenate_step_inputs([p.step for p in problems], counts)
     both = StepProblem(cloth, concatenate_states([p.state for p in problems]), steps)
     compare(simulator, CapturedSimulator(simulator, "fixed"), both, prepared, 1e-5)
+
+
+def test_a_traced_step_leaves_no_values_behind(skirt_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a cloth computes once is there before the step is traced: a second plan of it would take what has no values."""
+    simulator = build_simulator("local", "local_steps", "1x(mesh) | 1x(mesh)", latent_dim=8).eval()
+    prepared = prepare(simulator, skirt_scene)
+    cloth = replace(skirt_scene.cloth)  # nothing is known of it
+    monkeypatch.setattr(torch, "compile", lambda module, **options: module)
+    for frame in (0, 4):
+        there = replace(problem_of(skirt_scene, frame), cloth=cloth)
+        found = CapturedSimulator(simulator, "compiled").predict(there, prepared)
+        expected = simulator.predict(simulator.search(there), prepared)
+        assert type(found.next_pos) is Tensor
+        assert float((found.next_pos - expected.next_pos).abs().max()) < 1e-5
+    assert not [name for name, value in vars(cloth).items() if isinstance(value, FakeTensor)]
 
 
 def sheet(dtype: torch.dtype = torch.float32) -> tuple[StepProblem, np.ndarray]:
