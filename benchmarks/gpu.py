@@ -1,4 +1,4 @@
-"""All that is to be known about frames on one GPU, in one call of ten minutes: networks and solver at 1k to 50k vertices.
+"""All that is to be known about frames on one GPU, in one call of eight minutes: networks and solver at 1k to 50k vertices.
 
     python benchmarks/gpu.py --minutes 8 --csv gpu.csv
     python benchmarks/gpu.py --device-specs h100            # without a GPU: computed, from that one's data sheet
@@ -38,6 +38,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -135,14 +136,14 @@ def ask(words: Sequence[str], limit: float) -> tuple[list[Any], str]:
     )
     try:
         out, err = job.communicate(timeout=max(limit, 1.0))
-        why = (
-            ""
-            if job.returncode == 0
-            else f"exit code {job.returncode}: {(err.strip().splitlines() or ['nothing said'])[-1][:200]}"
-        )
-    except subprocess.TimeoutExpired:
-        os.killpg(job.pid, signal.SIGKILL)  # with what it has begun itself
+        said = err.strip().splitlines() or ["nothing said"]
+        why = f"exit code {job.returncode}: {said[-1][:200]}" if job.returncode else ""
+    except BaseException as error:  # of a session of its own: what it has begun itself would go on
+        with suppress(ProcessLookupError):
+            os.killpg(job.pid, signal.SIGKILL)
         out, _ = job.communicate()
+        if not isinstance(error, subprocess.TimeoutExpired):
+            raise
         why = f"not done after {limit:.0f} s"
     return [json.loads(line) for line in out.splitlines() if line.endswith(("}", "null"))], why
 

@@ -414,7 +414,7 @@ def solver_frame_rows(bench: Bench, iterations: int, device: Device) -> Iterator
 def rows_of_job(size: int, method: str, choice: str, device: Device, on_gpu: bool, kept: Path | None) -> Iterator[Row]:
     """The rows of a job: a network and a precision, a number of garments, or ``compiled``; the solver and iterations."""
     if choice == COMPILED and not on_gpu:
-        return
+        raise SystemExit("compiled frames are measured on a GPU; benchmarks/compiled_kernels.py counts their kernels without")
     bench = Bench(size, "cuda" if on_gpu else "cpu", 1 if size > 20000 else 3, kept)
     if method == SOLVER:
         yield from (

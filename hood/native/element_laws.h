@@ -1,4 +1,4 @@
-// The laws of membrane and bending, the compiled forms of hood/energies/membrane.py and bending.py, of some elements at a time.
+// The laws of membrane and bending, the compiled forms of hood/energies/membrane.py and bending.py, of as many elements at a time as a register holds.
 // Every compiled pass takes them from here. Orders of operations are part of a law: bits depend on them.
 #pragma once
 #include "lanes.h"

@@ -1,7 +1,7 @@
 // Energies of membrane and bending, and of what acts on single vertices, with their gradients, and edge strain: one pass over the
 // elements of a cloth, in float64.
 //
-// Elements are taken some at a time, one per lane; what they give is added up in their order, so that a result is the same in
+// Elements are taken as many at a time as a register holds; what they give is added up in their order, so that a result is the same in
 // every run. Tables of elements are padded to a multiple of eight.
 #include <algorithm>
 #include <cmath>

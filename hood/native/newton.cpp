@@ -2,7 +2,7 @@
 //
 // Everything lives in arrays that the caller owns (hood/solver/compiled/newton.py), so nothing here allocates. Vertices are numbered anew:
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
-// numbers a row. Elements are taken some at a time, one per lane, in float64; a row of 3 x 3 blocks is then gathered from the
+// numbers a row. Elements are taken as many at a time as a register holds, in float64; a row of 3 x 3 blocks is then gathered from the
 // elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
 // matrix a row keeps its diagonal block, which comes first, and those of later columns. Loops over elements and rows are shared by
 // threads where the cloth is large enough: in parts, each with its own sums, which are then added in their order.

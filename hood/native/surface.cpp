@@ -367,7 +367,7 @@ void walk_together(const Tree& tree, Walk* walks, int32_t count) {
 }
 
 // Corners of the faces of a leaf among positions (W, 3).
-inline void gather(const Tree& tree, int64_t leaf, const double* pos, double* table) {
+inline void fill_corners(const Tree& tree, int64_t leaf, const double* pos, double* table) {
     for (int c = 0; c < 3; ++c)
         for (int i = 0; i < WIDE; ++i)
             for (int k = 0; k < 3; ++k) table[WIDE * (3 * c + k) + i] = pos[3 * (int64_t)tree.corner_of[WIDE * (3 * leaf + c) + i] + k];
@@ -498,7 +498,7 @@ VN average(const Tree& tree, const double* values, const Fans& fans) {
     return sum;
 }
 
-// Work on the needed vertices ``begin`` to ``end``, some at a time, by threads.
+// Work on the needed vertices ``begin`` to ``end``, one a lane, by threads.
 template <class Work> void for_needed(const Tree& tree, int64_t begin, int64_t end, const Work& work) {
     for_parts(tree.parts, [&](int64_t part) {
         const Range range = range_of(end - begin, part, tree.parts, AT_ONCE);
@@ -946,7 +946,7 @@ void surface_build(Tree* tree, const double* centre) {
 // Takes up where the vertices are now.
 void surface_refit(Tree* tree) {
     ++tree->call, ++tree->fits;
-    for (int64_t leaf = 0; leaf < tree->num_leaves; ++leaf) gather(*tree, leaf, tree->pos, tree->corners + 9 * WIDE * leaf);
+    for (int64_t leaf = 0; leaf < tree->num_leaves; ++leaf) fill_corners(*tree, leaf, tree->pos, tree->corners + 9 * WIDE * leaf);
     for (int64_t i = 0; i < WIDE * tree->num_blocks; ++i)
         for (int k = 0; k < 3; ++k)
             tree->block_pos[3 * WIDE * (i / WIDE) + WIDE * k + i % WIDE] = tree->pos[3 * (int64_t)tree->block_vertex[i] + k];

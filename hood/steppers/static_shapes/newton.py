@@ -132,7 +132,13 @@ class FixedMinimizer:
         *,
         proceed: Proceed | None = None,
     ) -> tuple[Tensor, Report]:
-        """As :func:`hood.solver.newton.minimize`.
+        """Positions (V, 3) m at t + 1 and what was reached, as :func:`hood.solver.newton.minimize`.
+
+        Args:
+            potential: what is minimised; its search for contact is part of the pieces.
+            start: (V, 3) m, free vertices are taken from it; None: the contact-projected inertial guess.
+            settings: default ``NewtonSettings()``.
+            proceed: asked before every iteration; default always.
 
         Raises:
             ValueError: the potential has no such form.
