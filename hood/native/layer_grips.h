@@ -69,8 +69,7 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
 
 // Adds what pairs bring beside the diagonal blocks, with a share of the indefinite part, to q = H p: all that they bring, less those blocks.
 // Returns their p . q. Vertices from num_rows on do not move.
-template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_rows, double indefinite_share, const T* p, T* q) {
-    double sum = 0.0;
+template <class T> void couple_layer_grips(const LayerGrips& g, int64_t num_rows, double indefinite_share, const T* p, T* q) {
     for (int64_t i = 0; i < g.count; ++i) {
         const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, *weights = g.weights + 4 * i;
         const int32_t* corners = g.corners + 4 * i;
@@ -83,7 +82,6 @@ template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_ro
                                 model[3] * slip[2] - across * normal[2] + along * model[2]};
         for (int c = 0; c < 4; ++c)
             for (int k = 0; k < 3 && corners[c] < num_rows; ++k) q[4 * (int64_t)corners[c] + k] += (T)(weights[c] * push[k]);
-        sum += dot3(slip, push);
     }
     constexpr int PLACE[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     for (int64_t row = 0; row < num_rows; ++row) {
@@ -93,10 +91,8 @@ template <class T> double couple_layer_grips(const LayerGrips& g, int64_t num_ro
             double push = 0.0;
             for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + indefinite_share * less[PLACE[a][b]]) * (double)p[4 * row + b];
             q[4 * row + a] -= (T)push;
-            sum -= push * (double)p[4 * row + a];
         }
     }
-    return sum;
 }
 
 }  // namespace

@@ -96,9 +96,10 @@ struct Engine {
     void *matrix, *indefinite_part;           // (R, 9) + 1, (R)
     void *own, *own_indefinite_part;          // (N, 6) what acts on single vertices
     void *row_sum;                  // (parts, most_blocks, 16), aligned to 32 bytes
-    void *inverse, *x, *r, *z, *p, *q; // (N, 12), (N, 4) five times
+    void *block, *inverse, *x, *r, *z, *p, *q; // (N, 12) twice, (N, 4) five times
     double indefinite_share, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
+    double slope;  // J, of the potential along the last move, at its start
     int64_t cg_used;
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
@@ -463,12 +464,11 @@ inline void add_others(const OtherTerms& others, int64_t row, double* gradient, 
     for (int k = 0; k < 6; ++k) upper[k] += others.own[6 * row + k];
 }
 
-// Adds the blocks beside the diagonal to q = H p; returns their p . q.
-template <class T> double couple_layers(const Engine& e) {
+// Adds what the blocks beside the diagonal make of p to q.
+template <class T> void couple_layers(const Engine& e) {
     typedef typename Four<T>::type V4;
     const T *p = (const T*)e.p, *normals = rows_of_layers(*e.layers, T());
     T* q = (T*)e.q;
-    double sum = 0.0;
     for (int64_t i = 0; i < e.layers->num_contacts; ++i) {
         const int32_t* row = e.layers->rows + 4 * i;
         V4 n[4];
@@ -482,10 +482,8 @@ template <class T> double couple_layers(const Engine& e) {
         for (int c = 0; c < 4; ++c) {
             T* to = q + 4 * (int64_t)row[c];
             store(to, load<V4>(to) + (total - along[c]) * n[c]);
-            sum += (double)along[c] * (double)(total - along[c]);
         }
     }
-    return sum;
 }
 
 // ---- the potential -------------------------------------------------------------------------------------------------------
@@ -645,8 +643,9 @@ template <class T, int BLOCKS> inline void add_hinges(const Engine& e, int64_t f
     }
 }
 
-// Inverse of a symmetric block by cofactors, scaled to a diagonal of ones first; rows of four numbers.
-template <class T, class V4> inline void invert(const V4* m, T* inverse) {
+// A symmetric block and its inverse by cofactors, scaled to a diagonal of ones first; rows of four numbers.
+template <class T, class V4> inline void invert(const V4* m, T* block, T* inverse) {
+    for (int i = 0; i < 3; ++i) store(block + 4 * i, m[i]);
     double scale[3], a[3][3], c[3][3];
     for (int i = 0; i < 3; ++i) scale[i] = 1.0 / std::sqrt(m[i][i] > T(0) ? (double)m[i][i] : 2.2250738585072014e-308);
     for (int i = 0; i < 3; ++i)
@@ -667,7 +666,7 @@ template <class T, class V4> inline void invert(const V4* m, T* inverse) {
 // The upper rows of blocks, with a share of the indefinite part, and the inverse diagonal blocks of the matrix without it.
 template <class T> void gather_matrix(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
-    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *inverse = (T*)e.inverse;
+    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *block = (T*)e.block, *inverse = (T*)e.inverse;
     const T indefinite_share = (T)e.indefinite_share;
     const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
     V4* memory = (V4*)e.row_sum + 4 * e.most_blocks * part;
@@ -705,7 +704,7 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
                     sum.block[3 * place + k][j] += (T)(factor * (m[PAIR[k][j]] + e.indefinite_share * less[PAIR[k][j]]));
         });
         for (int k = 0; k < 3; ++k) sum.block[k] += sum.axial[0][0] * unit[k];
-        invert<T>(sum.block, inverse + 12 * row);
+        invert<T>(sum.block, block + 12 * row, inverse + 12 * row);
         for (int k = 0; k < 3; ++k)
             sum.block[k] += indefinite_share * V4{own_indefinite_part[PAIR[k][0]], own_indefinite_part[PAIR[k][1]], own_indefinite_part[PAIR[k][2]], T(0)};
         sum.axial[0][0] = T(0);
@@ -762,32 +761,59 @@ template <class T> void sharpen(Engine& e, double indefinite_share) {
 }
 
 // ---- the linear system ---------------------------------------------------------------------------------------------------
+//
+// Conjugate gradients with a symmetric Gauss-Seidel sweep as preconditioner, M = (B + L) B^-1 (B + U): B the diagonal blocks
+// without their indefinite part, which are positive, L and U the blocks below and above. In the variables r' = (B + L)^-1 r and
+// p' = (B + U) p the matrix is H' p' = p + (B + L)^-1 ((D - B) p + U p) with the diagonal blocks D that it has, and the
+// preconditioner B (Eisenstat 1981): an iteration goes through the blocks once backwards and once forwards, and there is no
+// product with H beside. Threads sweep over parts of their own; what couples the parts, and cloth with near cloth, is in H alone.
 
-// Of q = H p some rows of a part that ends at a row, and their p . q; a block serves its row and, transposed, its column. What
-// columns behind the part get is put aside: ``spill`` has ``reach`` rows of them.
-template <class T, bool INSIDE> inline D4 multiply_rows(const Engine& e, Range range, int64_t end, T* spill) {
+template <class T, class V4> inline V4 by_block(const T* m, V4 v) { return load<V4>(m) * v[0] + load<V4>(m + 4) * v[1] + load<V4>(m + 8) * v[2]; }
+
+// p' = z + share p', p from it, and (D - B) p + U p in the place of z, of some rows of a part that ends at a row.
+template <class T, bool INSIDE> inline void sweep_back(const Engine& e, Range range, int64_t end, T share) {
     typedef typename Four<T>::type V4;
-    const T *p = (const T*)e.p, *m = (const T*)e.matrix + 9 * (int64_t)e.row_starts[range.begin];
+    const T *matrix = (const T*)e.matrix, *inverse = (const T*)e.inverse;
+    T *p = (T*)e.p, *q = (T*)e.q, *turned = (T*)e.z;
+    const int32_t *cols = e.cols, *starts = e.row_starts;
+    for (int64_t row = range.end - 1; row >= range.begin; --row) {
+        const V4 along = load<V4>(q + 4 * row) + share * load<V4>(turned + 4 * row);
+        store(turned + 4 * row, along);
+        V4 a = V4{}, b = V4{}, c = V4{};
+        const int32_t first = starts[row];
+        for (int32_t i = starts[row + 1] - 1; i > first; --i) {
+            if (!INSIDE && cols[i] >= end) continue;
+            const T* m = matrix + 9 * (int64_t)i;
+            const V4 other = load<V4>(p + 4 * (int64_t)cols[i]);
+            a += load<V4>(m) * other, b += load<V4>(m + 3) * other, c += load<V4>(m + 6) * other;
+        }
+        const V4 above = {a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)}, rest = along - above;
+        const V4 step = by_block<T>(inverse + 12 * row, rest);
+        const T* own = matrix + 9 * (int64_t)first;
+        store(p + 4 * row, step);
+        store(q + 4 * row, load<V4>(own) * step[0] + load<V4>(own + 3) * step[1] + load<V4>(own + 6) * step[2] + above - rest);
+    }
+}
+
+// q = p + (B + L)^-1 q of a part; their p' . q.
+template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range range) {
+    typedef typename Four<T>::type V4;
+    const T *matrix = (const T*)e.matrix, *inverse = (const T*)e.inverse, *p = (const T*)e.p, *turned = (const T*)e.z;
     T* q = (T*)e.q;
     const int32_t *cols = e.cols, *starts = e.row_starts;
     D4 sum = D4{};
     for (int64_t row = range.begin; row < range.end; ++row) {
-        const V4 own = load<V4>(p + 4 * row);
-        const T x = own[0], y = own[1], z = own[2];
-        V4 a = load<V4>(m) * own, b = load<V4>(m + 3) * own, c = load<V4>(m + 6) * own;
-        m += 9;
-        for (int32_t i = starts[row] + 1; i < starts[row + 1]; ++i, m += 9) {
-            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6);
-            const int64_t col = 4 * (int64_t)cols[i];
-            const V4 other = load<V4>(p + col);
-            a += first * other, b += second * other, c += third * other;
-            T* target = INSIDE || cols[i] < end ? q + col : spill + (col - 4 * end);
-            store(target, load<V4>(target) + first * x + second * y + third * z);
+        const V4 step = by_block<T>(inverse + 12 * row, load<V4>(q + 4 * row));
+        const T x = step[0], y = step[1], z = step[2];
+        for (int32_t i = starts[row] + 1; i < starts[row + 1]; ++i) {
+            if (cols[i] >= range.end) break;
+            const T* m = matrix + 9 * (int64_t)i;
+            T* target = q + 4 * (int64_t)cols[i];
+            store(target, load<V4>(target) - (load<V4>(m) * x + load<V4>(m + 3) * y + load<V4>(m + 6) * z));
         }
-        const V4 before = load<V4>(q + 4 * row);
-        const V4 product = {before[0] + (a[0] + a[1] + a[2]), before[1] + (b[0] + b[1] + b[2]), before[2] + (c[0] + c[1] + c[2]), T(0)};
+        const V4 product = FROM_ZERO ? step : load<V4>(p + 4 * row) + step;
         store(q + 4 * row, product);
-        sum += __builtin_convertvector(product * own, D4);
+        if (!FROM_ZERO) sum += __builtin_convertvector(product * load<V4>(turned + 4 * row), D4);
     }
     return sum;
 }
@@ -796,20 +822,33 @@ inline Range behind(const Engine& e, Range range) { return {range.end, std::min(
 
 template <class T> inline T* spill_of(const Engine& e, int64_t part) { return (T*)e.spill + 4 * e.reach * part; }
 
-template <class T> D4 multiply(const Engine& e, int64_t part) {
+template <class T> void sweep_back(const Engine& e, int64_t part, T share) {
+    const Range range = rows_of(e, part);
+    const int64_t inside = e.parts == 1 ? range.end : std::max(range.begin, range.end - e.reach);
+    sweep_back<T, false>(e, {inside, range.end}, range.end, share);
+    sweep_back<T, true>(e, {range.begin, inside}, range.end, share);
+}
+
+// Adds to q what the blocks between a part and the rows behind it make of p; for those rows it is put aside: ``spill`` has ``reach``
+// rows of them.
+template <class T> void couple_part(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
     const Range range = rows_of(e, part), rest = behind(e, range);
-    std::memset((T*)e.q + 4 * range.begin, 0, sizeof(T) * 4 * (range.end - range.begin));
-    if (rest.begin == rest.end) return multiply_rows<T, true>(e, range, range.end, nullptr);
-    T* spill = spill_of<T>(e, part);
+    if (rest.begin == rest.end) return;
+    T *q = (T*)e.q, *spill = spill_of<T>(e, part);
+    const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
     std::memset(spill, 0, sizeof(T) * 4 * (rest.end - rest.begin));
-    const int64_t inside = std::max(range.begin, range.end - e.reach);
-    D4 sum = multiply_rows<T, true>(e, {range.begin, inside}, range.end, spill);
-    sum += multiply_rows<T, false>(e, {inside, range.end}, range.end, spill);
-    const T* p = (const T*)e.p;
-    for (int64_t row = rest.begin; row < rest.end; ++row)
-        sum += __builtin_convertvector(load<V4>(p + 4 * row) * load<V4>(spill + 4 * (row - rest.begin)), D4);
-    return sum;
+    for (int64_t row = std::max(range.begin, range.end - e.reach); row < range.end; ++row) {
+        const V4 own = load<V4>(p + 4 * row);
+        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.end; --i) {
+            const T* m = matrix + 9 * (int64_t)i;
+            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6), other = load<V4>(p + 4 * (int64_t)e.cols[i]);
+            const V4 a = first * other, b = second * other, c = third * other;
+            store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+            T* target = spill + 4 * (e.cols[i] - range.end);
+            store(target, load<V4>(target) + first * own[0] + second * own[1] + third * own[2]);
+        }
+    }
 }
 
 // Adds to the rows of a part what earlier parts have put aside for them.
@@ -824,53 +863,44 @@ template <class T> void take_spill(const Engine& e, int64_t part, T* q) {
     }
 }
 
-// z = P r for one row; adds r . z.
-template <class T, class V4> inline void precondition(const T* m, V4 r, T* z, D4& sum) {
-    const V4 result = load<V4>(m) * r[0] + load<V4>(m + 4) * r[1] + load<V4>(m + 8) * r[2];
-    store(z, result);
-    sum += __builtin_convertvector(result * r, D4);
+// z = B r of the rows of a part, in the place of q; r . z.
+template <class T> D4 precondition_rows(const Engine& e, Range range) {
+    typedef typename Four<T>::type V4;
+    const T *r = (const T*)e.r, *block = (const T*)e.block;
+    D4 sum = D4{};
+    for (int64_t row = range.begin; row < range.end; ++row) {
+        const V4 left = load<V4>(r + 4 * row), result = by_block<T>(block + 12 * row, left);
+        store((T*)e.q + 4 * row, result);
+        sum += __builtin_convertvector(result * left, D4);
+    }
+    return sum;
 }
 
 // The vectors of conjugate gradients where they begin, with x = 0; r . z of the rows of a part.
 template <class T> D4 begin_rows(const Engine& e, int64_t part, double scale) {
     typedef typename Four<T>::type V4;
-    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p;
-    const T* inverse = (const T*)e.inverse;
     const Range range = rows_of(e, part);
-    D4 sum = D4{};
-    for (int64_t row = range.begin; row < range.end; ++row) {
-        const V4 right = __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4);
-        store(x + 4 * row, V4{});
-        store(r + 4 * row, right);
-        precondition<T>(inverse + 12 * row, right, z + 4 * row, sum);
-    }
-    std::memcpy(p + 4 * range.begin, z + 4 * range.begin, sizeof(T) * 4 * (range.end - range.begin));
-    return sum;
+    const int64_t first = 4 * range.begin, size = sizeof(T) * 4 * (range.end - range.begin);
+    for (int64_t row = range.begin; row < range.end; ++row)
+        store((T*)e.q + 4 * row, __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
+    std::memset((T*)e.x + first, 0, size);
+    std::memset((T*)e.z + first, 0, size);
+    sweep_on<T, true>(e, range);
+    std::memcpy((T*)e.r + first, (T*)e.q + first, size);
+    return precondition_rows<T>(e, range);
 }
 
 // A step along p; r . z of the rows of a part.
 template <class T> D4 step_rows(const Engine& e, int64_t part, T length) {
     typedef typename Four<T>::type V4;
-    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z;
-    const T *p = (const T*)e.p, *q = (const T*)e.q, *inverse = (const T*)e.inverse;
+    T *x = (T*)e.x, *r = (T*)e.r;
+    const T *p = (const T*)e.p, *q = (const T*)e.q;
     const Range range = rows_of(e, part);
-    take_spill<T>(e, part, (T*)e.q);
-    D4 sum = D4{};
     for (int64_t row = range.begin; row < range.end; ++row) {
-        const V4 left = load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row);
         store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
-        store(r + 4 * row, left);
-        precondition<T>(inverse + 12 * row, left, z + 4 * row, sum);
+        store(r + 4 * row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
     }
-    return sum;
-}
-
-template <class T> void turn_rows(const Engine& e, int64_t part, T share) {
-    typedef typename Four<T>::type V4;
-    const T* z = (const T*)e.z;
-    T* p = (T*)e.p;
-    const Range range = rows_of(e, part);
-    for (int64_t row = range.begin; row < range.end; ++row) store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
+    return precondition_rows<T>(e, range);
 }
 
 // The sum over the parts, and then over the axes.
@@ -879,6 +909,18 @@ template <class Compute> inline double sum_parts(const Engine& e, const Compute&
     for_parts(e.parts, [&](int64_t part) { sums[part] = compute(part); });
     const D4 sum = sums.total(e.parts);
     return (sum[0] + sum[1]) + sum[2];
+}
+
+// q = H' p' for p' = z + share p'; their product.
+template <class T> double multiply(const Engine& e, T share) {
+    for_parts(e.parts, [&](int64_t part) { sweep_back<T>(e, part, share); });
+    if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, part); });
+    if (near_layers(e)) couple_layers<T>(e);
+    if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
+    return sum_parts(e, [&](int64_t part) {
+        take_spill<T>(e, part, (T*)e.q);
+        return sweep_on<T, false>(e, rows_of(e, part));
+    });
 }
 
 // Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
@@ -890,11 +932,10 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
     double rz = sum_parts(e, [&](int64_t part) { return begin_rows<T>(e, part, scale); });
     const double limit = tolerance * tolerance * rz;
+    T share = T(0);
     bool definite = true;
     for (int64_t iteration = 0; iteration < most && rz > limit; ++iteration) {
-        double curvature = sum_parts(e, [&](int64_t part) { return multiply<T>(e, part); });
-        if (near_layers(e)) curvature += couple_layers<T>(e);
-        if (e.layer_grips) curvature += couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
+        const double curvature = multiply<T>(e, share);
         if (!(curvature > 0.0)) {
             definite = false;
             break;
@@ -902,8 +943,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
         const T length = (T)(rz / curvature);
         const double before = rz;
         rz = sum_parts(e, [&](int64_t part) { return step_rows<T>(e, part, length); });
-        const T share = (T)(rz / before);
-        for_parts(e.parts, [&](int64_t part) { turn_rows<T>(e, part, share); });
+        share = (T)(rz / before);
         ++e.cg_used;
     }
     const T* x = (const T*)e.x;
@@ -1062,6 +1102,7 @@ void take_trial(Engine& e, double phi, double noise) {
 bool backtrack(Engine& e) {
     double slope = 0.0, length = 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row) slope += dot3(e.gradient + 4 * row, e.direction + 4 * row);
+    e.slope = slope;
     if (!(slope < 0.0)) return false;
     for (int attempt = 0; attempt < 40; ++attempt) {
         double phi, noise;
@@ -1267,7 +1308,7 @@ void newton_together(Engine* e, const float* force, const float* damping, int64_
         }
         const V4 rows[3] = {V4{block[0], block[1], block[2], Real(0)}, V4{block[3], block[4], block[5], Real(0)},
                             V4{block[6], block[7], block[8], Real(0)}};
-        invert<Real>(rows, (Real*)e->inverse + 12 * row);
+        invert<Real>(rows, (Real*)e->block + 12 * row, (Real*)e->inverse + 12 * row);
     }
     solve<Real>(*e, 0.0, iterations);
     for (int64_t row = 0; row < e->num_rows; ++row)

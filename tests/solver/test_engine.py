@@ -70,6 +70,20 @@ def dense_of(plan, triples) -> np.ndarray:
 BLOWN = default_potential().with_terms(
     wind=Wind([3.0, 1.0, -2.0], gusts=0.3), stretch_damping=StretchDamping(0.02), bend_damping=BendDamping(0.03)
 )
+CLOSELY = 1e-6  # a relative gradient, from which the solver decides how closely linear systems are solved: as closely as it can
+
+
+def after(potential, problem, settings, count):
+    """Positions (V, 3) and potential [J] after so many iterations with linear systems solved closely."""
+    problem = potential.prepare(problem)
+    system = newton.system_of(potential, problem, plan_for(problem), settings)
+    system.begin(None)
+    for _ in range(count):
+        system.model()
+        assert system.move([CLOSELY] * problem.num_scenes, [True] * problem.num_scenes)
+    return system.state()[0], system.phi
+
+
 POTENTIALS = {"default": default_potential(), "reference": reference_potential(), "wind and damping": BLOWN}
 
 
@@ -102,14 +116,23 @@ def test_potential_gradient_and_matrix_are_those_of_the_torch_form(name, kind):
 @pytest.mark.parametrize("potential", [default_potential(), BLOWN], ids=["default", "wind and damping"])
 @pytest.mark.parametrize("make", [hanging, falling, touching_sheet])
 def test_iterations_are_those_of_the_torch_form(make, potential):
-    """With its linear solver in float32; sums in another order part slowly."""
+    """With linear systems solved closely: the two have preconditioners of their own."""
     problem = make()
     for count in range(4):
-        there, expected = minimize(potential, problem, settings=replace(TORCH, max_iterations=count))
-        here, report = minimize(potential, problem, settings=replace(COMPILED, max_iterations=count))
-        assert report.iterations == expected.iterations
-        assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
-        torch.testing.assert_close(report.phi, expected.phi, rtol=1e-5, atol=1e-9)
+        there, expected = after(potential, problem, TORCH, count)
+        here, phi = after(potential, problem, COMPILED, count)
+        assert float((here - there).norm()) <= 2e-2 * float((there - problem.state.pos).norm())
+        assert phi == pytest.approx(expected, rel=2e-2, abs=1e-6)
+
+
+@pytest.mark.parametrize("make", [hanging, falling])  # the sheet in the air has many
+def test_the_minimum_is_that_of_the_torch_form(make):
+    problem = make()
+    there, expected = minimize(default_potential(), problem, settings=replace(TORCH, target_rg=1e-6))
+    here, report = minimize(default_potential(), problem, settings=replace(COMPILED, target_rg=1e-6))
+    assert report.converged.all() and expected.converged.all()
+    assert float((here - there).norm()) <= 1e-5 * float((there - problem.state.pos).norm())
+    torch.testing.assert_close(report.phi, expected.phi, rtol=1e-9, atol=1e-12)
 
 
 def test_scenes_of_a_batch_do_not_touch_each_other():

@@ -102,6 +102,7 @@ class CompiledScene:
             "indefinite_part": blocks,
             "own": 6 * rows,
             "own_indefinite_part": 6 * rows,
+            "block": 12 * rows,
             "inverse": 12 * rows,
         }
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
