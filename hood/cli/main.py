@@ -110,6 +110,9 @@ def aloud(sentence: str, error: bool, passing: bool) -> None:
 def _run(name: str, overrides: Sequence[str]) -> int:
     try:
         command = _command(name)
+        if not gc.isenabled():  # see entry()
+            gc.freeze()
+            gc.enable()
         from hood.app.common import GivenUpError
         from hood.app.notices import heard
 
@@ -196,6 +199,7 @@ def _usage() -> str:
 def entry(argv: Sequence[str] | None = None) -> None:
     """Console entry: the process is set up before torch is loaded, then runs the command and ends with its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    gc.disable()  # while modules are read: they stay anyway, and to look for garbage among them takes half a second
     leave_working_folder()
     _name_program()
     if sys.platform.startswith("linux"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,7 +27,6 @@ from hood.media.renderer.render import (
     render_frame,
 )
 from hood.media.video import VideoWriter, save_png
-from hood.native.arguments import num_parts
 from hood.rollouts.file.reader import RolloutData
 
 _SHEET_FRAMES = 12
@@ -159,9 +159,9 @@ def write_video(
 
 
 def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:
-    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as torch has, up to
-    :data:`_THREADS`."""
-    threads = num_parts(_THREADS, 1)
+    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as this process may use
+    processors, up to :data:`_THREADS`: no picture depends on their number."""
+    threads = min(_THREADS, _processors())
     if threads == 1:
         yield from map(film.frame, frames)
         return
@@ -173,6 +173,11 @@ def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
+
+
+def _processors() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)  # not every system has it
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def _prints(data: RolloutData, textures: Mapping[str, Texture]) -> list[Print]:

@@ -104,7 +104,7 @@ class VideoWriter:
                 codec="libx264",
                 pix_fmt_out="yuv420p",
                 macro_block_size=2,
-                output_params=["-crf", "20", "-movflags", "+faststart"],
+                output_params=["-preset", "veryfast", "-crf", "20", "-movflags", "+faststart"],
                 ffmpeg_log_level="error",
             )
             self._stream.send(None)

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include "vector.h"
 
@@ -17,9 +18,10 @@ extern "C" {
 // As `LightValues` of hood/media/renderer/raster.py.
 struct Light {
     const double* map;     // (size, size) nearness of what the key light sees
+    const double* most;    // (tiles, tiles) the most of it from a tile before each tile of 16 x 16 to one behind
     const double* probes;  // (num_probes, 2) texels
     const double* axes;    // (3, 3) of the key light's view
-    int64_t size, num_probes;
+    int64_t size, num_probes, tiles;
     double low[2];         // m, corner of the map
     double scale, texel;   // texels per m, m
     double key[3], fill[3];
@@ -35,7 +37,6 @@ struct Seen {
     const double* nearness;                               // (height, width) 1/m
     const double* around;                                 // (4, num_around, 2) shares of the reach, by the pixel's place in its four
     const double* axes;                                   // (3, 3) right, up, forward
-    double* image;                                        // (height, width, 3) linear colours
     const double* own;  // (height, width, 3) colours instead of those of vertices where not NaN; null: nowhere
     int64_t width, height, num_around;
     double eye[3];
@@ -45,8 +46,7 @@ struct Seen {
 // As `FloorValues` of hood/media/renderer/raster.py: what lies behind the surface.
 struct Floor {
     const double* dark;  // (cells, cells) shade under low parts
-    double* image;       // (samples * height, samples * width, 3) linear colours
-    int64_t width, height, cells, samples;
+    int64_t width, height, cells;
     double eye[3], right[3], up[3], forward[3], center[3];
     double tan_y, floor, cell;
     double ground[3], horizon[3], zenith[3];  // ground linear, the others as shown
@@ -68,22 +68,22 @@ void picture_rasterise(const double* screen, const double* nearness, const int64
         const double bottom = std::min(std::floor(std::max({y[0], y[1], y[2]}) - 0.5), height - 1.0);
         const bool outside = std::max({x[0], x[1], x[2]}) <= 0 || std::min({x[0], x[1], x[2]}) >= width;
         if (!(std::fabs(area) > least_area) || outside || !(bottom >= top)) continue;
-        double slope_x[3], slope_y[3], constant[3], along = 0.0;
+        double slope_x[3], slope_y[3], constant[3], per_slope[3], along = 0.0;
         for (int k = 0; k < 3; ++k) {
             const int n = (k + 1) % 3, p = (k + 2) % 3;
             slope_x[k] = (y[n] - y[p]) / area;
             slope_y[k] = (x[p] - x[n]) / area;
             constant[k] = (x[n] * y[p] - x[p] * y[n]) / area;
             along += slope_x[k] * near[k];
+            per_slope[k] = 1.0 / (std::fabs(slope_x[k]) < 1e-12 ? 1e-12 : slope_x[k]);
         }
         for (int64_t row = (int64_t)top; row <= (int64_t)bottom; ++row) {
             double lower = -INFINITY, upper = INFINITY, here = 0.0;
             for (int k = 0; k < 3; ++k) {
                 const double at_row = slope_y[k] * (row + 0.5) + constant[k];
-                const double safe = std::fabs(slope_x[k]) < 1e-12 ? 1e-12 : slope_x[k];
-                const double root = -at_row / safe;
-                if (safe > 0) lower = std::max(lower, root);
-                if (safe < 0) upper = std::min(upper, root);
+                const double root = -at_row * per_slope[k];
+                if (per_slope[k] > 0) lower = std::max(lower, root);
+                else upper = std::min(upper, root);
                 here += at_row * near[k];
             }
             const double first = std::max(std::ceil(lower - 0.5 - tolerance), 0.0);
@@ -108,7 +108,10 @@ double lit_at(const Light& light, Vec p, double spread) {
     double seen[3];
     for (int k = 0; k < 3; ++k) seen[k] = dot(at(light.axes, k), p);
     const double across = (seen[0] - light.low[0]) * light.scale + 4.0, down = (seen[1] - light.low[1]) * light.scale + 4.0;
-    const double bound = 0.004 + 1.5 * spread * light.texel - seen[2], most = light.size - 1.0;
+    const double bound = 0.004 + 1.5 * spread * light.texel - seen[2], most = light.size - 1.0, edge = 4.0 * spread;
+    if (across < -edge || down < -edge || across > most + edge || down > most + edge) return 1.0;  // the map's rim is empty
+    const int64_t tile = ((int64_t)clip(down, 0.0, most) >> 4) * light.tiles + ((int64_t)clip(across, 0.0, most) >> 4);
+    if (!(light.most[tile] > bound)) return 1.0;
     int64_t covered = 0;
     for (int64_t i = 0; i < light.num_probes; ++i) {
         const int64_t column = (int64_t)clip(across + spread * light.probes[2 * i], 0.0, most);
@@ -124,24 +127,28 @@ double power_24(double v) {
 }
 
 // Share of the light from all sides that is not kept off by what is near: as `openness` of hood/media/renderer/shading.py.
-double openness(const Seen& s, int64_t row, int64_t column, Vec normal) {
-    const double across = 0.5 * s.width, up = 0.5 * s.height, depth = 1.0 / s.nearness[row * s.width + column];
-    const double x = (column + 0.5 - across) / s.focal * depth, y = (up - row - 0.5) / s.focal * depth;
+// Depths (height, width) in m, 0 where nothing is seen.
+double openness(const Seen& s, const float* depths, int64_t row, int64_t column, Vec normal) {
+    const double across = 0.5 * s.width, up = 0.5 * s.height, depth = depths[row * s.width + column];
+    const double per_pixel = 1.0 / s.focal, per_reach = 1.0 / (s.reach * s.reach);
+    const double x = (column + 0.5 - across) * per_pixel * depth, y = (up - row - 0.5) * per_pixel * depth;
     const double n[3] = {dot(at(s.axes, 0), normal), dot(at(s.axes, 1), normal), dot(at(s.axes, 2), normal)};
     const double reach = s.focal * s.reach / depth;
-    const double* offset = s.around + 2 * s.num_around * (2 * (row % 2) + column % 2);
+    const int64_t place = 2 * (row % 2) + column % 2;
     double kept = 0.0;
-    for (int64_t k = 0; k < s.num_around; ++k) {
+    for (int64_t i = 0; i < 2 * s.num_around; ++i) {
+        const int64_t k = i % s.num_around;
+        const double* offset = s.around + 2 * s.num_around * (i < s.num_around ? place : 3 - place);
         const int64_t c = (int64_t)std::floor(column + 0.5 + reach * offset[2 * k]);
         const int64_t r = (int64_t)std::floor(row + 0.5 + reach * offset[2 * k + 1]);
-        if (c < 0 || r < 0 || c >= s.width || r >= s.height || s.face[r * s.width + c] < 0) continue;
-        const double there = 1.0 / s.nearness[r * s.width + c];
-        const double dx = (c + 0.5 - across) / s.focal * there - x, dy = (up - r - 0.5) / s.focal * there - y, dz = there - depth;
-        const double dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq / (s.reach * s.reach);
-        if (far >= 1.0 || dist_sq <= 0.0) continue;
-        kept += std::max((n[0] * dx + n[1] * dy + n[2] * dz) / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
+        if (c < 0 || r < 0 || c >= s.width || r >= s.height) continue;
+        const double there = depths[r * s.width + c];
+        const double dx = (c + 0.5 - across) * per_pixel * there - x, dy = (up - r - 0.5) * per_pixel * there - y, dz = there - depth;
+        const double dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq * per_reach, above = n[0] * dx + n[1] * dy + n[2] * dz;
+        if (there == 0.0 || far >= 1.0 || !(above > 0.0)) continue;
+        kept += std::max(above / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
     }
-    return clip(1.0 - 2.2 * kept / s.num_around, 0.2, 1.0);
+    return clip(1.0 - 1.1 * kept / s.num_around, 0.2, 1.0);
 }
 
 // Share of the colour left by the hem's edge and its seam, smoothed over the pixel's footprint [m].
@@ -167,6 +174,36 @@ void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, double 
     }
 }
 
+// Colour of a pixel that sees a face; one seen from inside is darker.
+void shade_pixel(const Light& light, const Seen& seen, const float* depths, int64_t row, int64_t column, double* out) {
+    const int64_t pixel = row * seen.width + column;
+    const int64_t* corner = seen.faces + 3 * (int64_t)seen.face[pixel];
+    const double *a = seen.screen + 2 * corner[0], *b = seen.screen + 2 * corner[1], *c = seen.screen + 2 * corner[2];
+    const double px = column + 0.5 - a[0], py = row + 0.5 - a[1];
+    const double turned = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    const double second = (px * (c[1] - a[1]) - py * (c[0] - a[0])) / turned;
+    const double third = ((b[0] - a[0]) * py - (b[1] - a[1]) * px) / turned;
+    double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
+    for (int k = 0; k < 3; ++k) sum += weight[k] /= seen.depth[corner[k]];
+    Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
+    double hem = 0.0;
+    for (int k = 0; k < 3; ++k) {
+        const double share = clip(weight[k] / sum, 0.0, 1.0);
+        pos = pos + share * at(seen.pos, corner[k]);
+        color = color + share * at(seen.color, corner[k]);
+        normal = normal + share * at(seen.normal, corner[k]);
+        hem += share * seen.hem[corner[k]];
+    }
+    if (seen.own && !std::isnan(seen.own[3 * pixel])) color = at(seen.own, pixel);
+    normal = unit(normal);
+    if (turned > 0) {
+        normal = -normal;
+        color = seen.inside * color;
+    }
+    color = sewn(hem, 1.0 / (seen.focal * seen.nearness[pixel])) * color;
+    shade(light, pos, normal, unit(at(seen.eye, 0) - pos), color, openness(seen, depths, row, column, normal), out);
+}
+
 }  // namespace
 
 extern "C" {
@@ -174,63 +211,6 @@ extern "C" {
 // Share of the key light at points (P, 3) that is not in shadow.
 void picture_lit(const Light* light, const double* points, int64_t count, double spread, double* out) {
     for (int64_t i = 0; i < count; ++i) out[i] = lit_at(*light, at(points, i), spread);
-}
-
-// Colours of all pixels that see a face; a face seen from inside is darker.
-void picture_shade(const Light* light, const Seen* seen) {
-    const Vec eye = at(seen->eye, 0);
-    for (int64_t row = 0; row < seen->height; ++row)
-        for (int64_t column = 0; column < seen->width; ++column) {
-            const int64_t pixel = row * seen->width + column, face = seen->face[pixel];
-            if (face < 0) continue;
-            const int64_t* corner = seen->faces + 3 * face;
-            const double *a = seen->screen + 2 * corner[0], *b = seen->screen + 2 * corner[1], *c = seen->screen + 2 * corner[2];
-            const double px = column + 0.5 - a[0], py = row + 0.5 - a[1];
-            const double turned = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
-            const double second = (px * (c[1] - a[1]) - py * (c[0] - a[0])) / turned;
-            const double third = ((b[0] - a[0]) * py - (b[1] - a[1]) * px) / turned;
-            double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
-            for (int k = 0; k < 3; ++k) sum += weight[k] /= seen->depth[corner[k]];
-            Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
-            double hem = 0.0;
-            for (int k = 0; k < 3; ++k) {
-                const double share = clip(weight[k] / sum, 0.0, 1.0);
-                pos = pos + share * at(seen->pos, corner[k]);
-                color = color + share * at(seen->color, corner[k]);
-                normal = normal + share * at(seen->normal, corner[k]);
-                hem += share * seen->hem[corner[k]];
-            }
-            if (seen->own && !std::isnan(seen->own[3 * pixel])) color = at(seen->own, pixel);
-            normal = unit(normal);
-            if (turned > 0) {
-                normal = -normal;
-                color = seen->inside * color;
-            }
-            color = sewn(hem, 1.0 / (seen->focal * seen->nearness[pixel])) * color;
-            const double open = openness(*seen, row, column, normal);
-            shade(*light, pos, normal, unit(eye - pos), color, open, seen->image + 3 * pixel);
-        }
-}
-
-// Average of 2 x 2 samples, as shown: (height, width, 3) of 0 to 255 from linear colours of twice the size.
-void picture_resolve(const double* samples, int64_t width, int64_t height, uint8_t* out) {
-    double least[257];  // mean from which a number is shown
-    for (int k = 0; k < 257; ++k) least[k] = k == 0 ? -1.0 : k == 256 ? 2.0 : std::pow((k - 0.5) / 255.0, 2.2);
-    uint8_t guess[1025];  // the number at the beginning of every 1024th
-    for (int i = 0, k = 0; i < 1025; ++i) {
-        while (least[k + 1] <= i / 1024.0) ++k;
-        guess[i] = (uint8_t)k;
-    }
-    for (int64_t row = 0; row < height; ++row)
-        for (int64_t i = 0; i < 3 * width; ++i) {
-            const int64_t left = 2 * row * 6 * width + 6 * (i / 3) + i % 3;
-            const double* low = samples + left + 6 * width;
-            const double mean = (((samples[left] + samples[left + 3]) + low[0]) + low[3]) / 4.0;
-            const double shown = clip(mean, 0.0, 1.0);
-            int k = guess[(int)(1024.0 * shown)];
-            while (least[k + 1] <= shown) ++k;
-            out[row * 3 * width + i] = (uint8_t)k;
-        }
 }
 
 }  // extern "C"
@@ -252,56 +232,121 @@ double sample(const Floor& f, double row, double column) {
 
 double positive_remainder(double v) { return v - std::floor(v); }
 
+// What rays that go down as steeply have in common: a row of pixels does, unless the picture is turned.
+struct Steep {
+    double down = 0.0, reach, per_foot, thin;
+
+    void see(const Floor& f, double drop, double ray_down) {
+        if (ray_down == down) return;
+        down = ray_down, reach = drop / ray_down;
+        const double foot = std::max(reach * 2.0 * f.tan_y / f.height, 1e-4) * std::sqrt(std::max(reach / drop, 1.0));
+        per_foot = 1.0 / foot, thin = std::min(1.0, 0.01 / foot);
+    }
+};
+
 // Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint.
-double grid_lines(Vec pos, double pixel, double stretch) {
-    const double foot = std::max(pixel, 1e-4) * std::sqrt(std::max(stretch, 1.0));
+double grid_lines(Vec pos, const Steep& steep) {
     double lines = 0.0;
     for (double along : {pos.x, pos.z}) {
         const double offset = std::fabs(positive_remainder(along / 0.5 + 0.5) - 0.5) * 0.5;
-        lines = std::max(lines, clip((0.005 - offset) / foot + 0.5, 0.0, 1.0) * std::min(1.0, 0.01 / foot));
+        lines = std::max(lines, clip((0.005 - offset) * steep.per_foot + 0.5, 0.0, 1.0) * steep.thin);
     }
     return lines;
 }
 
-void floor_color(const Light& light, const Floor& f, Vec ray, double drop, double* out) {
-    const double reach = drop / -ray.y;
-    const Vec pos = at(f.eye, 0) + reach * ray;
-    const double from_x = pos.x - f.center[0], from_z = pos.z - f.center[2], away = std::hypot(from_x, from_z);
-    const double fade = std::exp(-(away / 3.2) * (away / 3.2));
-    const double lines = grid_lines(pos, reach * 2.0 * f.tan_y / f.height, reach / drop);
-    const double half = f.cells / 2.0 - 0.5;
-    double left = 1.0 - clip(sample(f, from_z / f.cell + half, from_x / f.cell + half), 0.0, 0.6);
-    if (away < 3.0) left *= 0.80 + 0.20 * lit_at(light, pos, 2.5);
-    const double blend = clip(fade, 0.0, 1.0);
-    for (int k = 0; k < 3; ++k) out[k] = blend * (f.ground[k] * (1.0 - 0.16 * lines * fade) * left) + (1.0 - blend) * out[k];
+void floor_color(const Light& light, const Floor& f, const Steep& steep, Vec ray, double* out) {
+    const Vec pos = at(f.eye, 0) + steep.reach * ray;
+    const double from_x = pos.x - f.center[0], from_z = pos.z - f.center[2], away_sq = from_x * from_x + from_z * from_z;
+    if (away_sq > 400.0) return;  // faded to 1e-17
+    const double fade = std::exp(-away_sq * (1.0 / (3.2 * 3.2))), lines = grid_lines(pos, steep);
+    const double half = f.cells / 2.0 - 0.5, per_cell = 1.0 / f.cell;
+    double left = 1.0 - clip(sample(f, from_z * per_cell + half, from_x * per_cell + half), 0.0, 0.6);
+    if (away_sq < 9.0) left *= 0.80 + 0.20 * lit_at(light, pos, 2.5);
+    for (int k = 0; k < 3; ++k) out[k] = fade * (f.ground[k] * (1.0 - 0.16 * lines * fade) * left) + (1.0 - fade) * out[k];
 }
+
+// Linear colours of the sky by how high a ray goes, 0 to 1: between the entries it is straight to 1e-7.
+struct Sky {
+    static constexpr int STEPS = 1024;
+    double color[STEPS + 2][3];
+
+    explicit Sky(const Floor& f) {
+        for (int i = 0; i < STEPS + 2; ++i)
+            for (int k = 0; k < 3; ++k) color[i][k] = std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * i / STEPS, 2.2);
+    }
+    void at(double high, double* out) const {
+        const int i = (int)(STEPS * high);
+        const double share = STEPS * high - i;
+        for (int k = 0; k < 3; ++k) out[k] = color[i][k] + share * (color[i + 1][k] - color[i][k]);
+    }
+};
+
+// What is behind the surface: the floor, which fades into a plain background.
+void background(const Light& light, const Floor& f, const Sky& sky, Steep& steep, int64_t row, int64_t column, double* out) {
+    const double per_pixel = f.tan_y / (0.5 * f.height), drop = f.eye[1] - f.floor;
+    const double x = (column + 0.5 - 0.5 * f.width) * per_pixel, y = (0.5 * f.height - row - 0.5) * per_pixel;
+    const Vec ray = at(f.forward, 0) + x * at(f.right, 0) + y * at(f.up, 0);
+    sky.at(ray.y > 0.0 ? clip(1.6 * ray.y / std::sqrt(dot(ray, ray)), 0.0, 1.0) : 0.0, out);
+    if (!(ray.y < -1e-4 && drop >= 1e-3)) return;
+    steep.see(f, drop, -ray.y);
+    floor_color(light, f, steep, ray, out);
+}
+
+// The numbers 0 to 255 by which linear colours are shown.
+struct Shown {
+    double least[257];    // from which a number is shown
+    uint8_t guess[1025];  // the number at the beginning of every 1024th
+
+    Shown() {
+        for (int k = 0; k < 257; ++k) least[k] = k == 0 ? -1.0 : k == 256 ? 2.0 : std::pow((k - 0.5) / 255.0, 2.2);
+        for (int i = 0, k = 0; i < 1025; ++i) {
+            while (least[k + 1] <= i / 1024.0) ++k;
+            guess[i] = (uint8_t)k;
+        }
+    }
+    uint8_t operator()(double color) const {
+        const double shown = clip(color, 0.0, 1.0);
+        int k = guess[(int)(1024.0 * shown)];
+        while (least[k + 1] <= shown) ++k;
+        return (uint8_t)k;
+    }
+};
 
 }  // namespace
 
 extern "C" {
 
-// The floor, which fades into a plain background.
-void picture_backdrop(const Light* light, const Floor* floor) {
-    const Floor& f = *floor;
-    const double drop = f.eye[1] - f.floor;
-    double horizon[3];
-    for (int k = 0; k < 3; ++k) horizon[k] = std::pow(f.horizon[k], 2.2);
-    for (int64_t row = 0; row < f.height; ++row)
-        for (int64_t column = 0; column < f.width; ++column) {
-            const double x = (column + 0.5 - 0.5 * f.width) / (0.5 * f.height) * f.tan_y;
-            const double y = (0.5 * f.height - row - 0.5) / (0.5 * f.height) * f.tan_y;
-            const Vec ray = at(f.forward, 0) + x * at(f.right, 0) + y * at(f.up, 0);
-            const double high = clip(1.6 * ray.y / std::sqrt(dot(ray, ray)), 0.0, 1.0);
-            double* out = f.image + 3 * f.samples * (row * f.samples * f.width + column);
-            for (int k = 0; k < 3; ++k) out[k] = high > 0 ? std::pow(f.horizon[k] + (f.zenith[k] - f.horizon[k]) * high, 2.2) : horizon[k];
-            if (ray.y < -1e-4 && drop >= 1e-3) floor_color(*light, f, ray, drop, out);
-            for (int64_t i = 1; i < f.samples; ++i) std::copy(out, out + 3, out + 3 * i);
-        }
-    const int64_t line = 3 * f.samples * f.width;
-    for (int64_t row = 0; row < f.height; ++row)
-        for (int64_t i = 1; i < f.samples; ++i) {
-            const double* first = f.image + row * f.samples * line;
-            std::copy(first, first + line, f.image + (row * f.samples + i) * line);
+// The picture (height, width, 3) of the floor's size: the mean of 2 x 2 pixels of what is seen, of which those with one face have the
+// colour of the first; the background where they see nothing.
+void picture_draw(const Light* light, const Seen* seen, const Floor* floor, uint8_t* out) {
+    const Sky sky(*floor);
+    const Shown shown;
+    Steep steep;
+    thread_local std::vector<float> depths;
+    depths.resize((size_t)(seen->width * seen->height));
+    for (int64_t i = 0; i < seen->width * seen->height; ++i) depths[i] = seen->face[i] < 0 ? 0.0f : (float)(1.0 / seen->nearness[i]);
+    for (int64_t row = 0; row < floor->height; ++row)
+        for (int64_t column = 0; column < floor->width; ++column, out += 3) {
+            double sum[3] = {0.0, 0.0, 0.0}, color[4][3];
+            int32_t face[4];
+            int empty = 0;
+            for (int64_t i = 0; i < 4; ++i) {
+                const int64_t below = 2 * row + i / 2, right = 2 * column + i % 2;
+                face[i] = seen->face[below * seen->width + right];
+                if (face[i] < 0) {
+                    ++empty;
+                    continue;
+                }
+                int64_t first = 0;
+                while (face[first] != face[i]) ++first;
+                if (first == i) shade_pixel(*light, *seen, depths.data(), below, right, color[i]);
+                for (int k = 0; k < 3; ++k) sum[k] += color[first][k];
+            }
+            if (empty > 0) {
+                background(*light, *floor, sky, steep, row, column, color[0]);
+                for (int k = 0; k < 3; ++k) sum[k] += empty * color[0][k];
+            }
+            for (int k = 0; k < 3; ++k) out[k] = shown(sum[k] / 4.0);
         }
 }
 

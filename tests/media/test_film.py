@@ -80,7 +80,7 @@ def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, mon
         time.sleep(0.02)  # so that one thread cannot do it all
         return Film.frame(film, index)
 
-    monkeypatch.setattr("hood.media.film.num_parts", lambda count, least: threads)
+    monkeypatch.setattr("hood.media.film._processors", lambda: threads)
     monkeypatch.setattr(film, "frame", seen)
     found = list(drawn(film, iter((6, 0, 3, 3, 1))))
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
@@ -90,6 +90,6 @@ def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, mon
 
 def test_a_frame_that_cannot_be_drawn_ends_the_film(monkeypatch: pytest.MonkeyPatch) -> None:
     film = Film(ball_in_a_tube(), 96, 128)
-    monkeypatch.setattr("hood.media.film.num_parts", lambda count, least: 2)
+    monkeypatch.setattr("hood.media.film._processors", lambda: 2)
     with pytest.raises(IndexError):
         list(drawn(film, [0, 99]))

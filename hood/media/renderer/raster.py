@@ -32,8 +32,8 @@ class LightValues(ctypes.Structure):
     """``Light`` of ``picture.cpp``."""
 
     _fields_ = [
-        *fields("map probes axes", POINTER),
-        *fields("size num_probes", COUNT),
+        *fields("map most probes axes", POINTER),
+        *fields("size num_probes tiles", COUNT),
         ("low", REAL * 2),
         *fields("scale texel", REAL),
         *fields("key fill key_color fill_color sky_color bounce_color", _TRIPLE),
@@ -44,7 +44,7 @@ class SeenValues(ctypes.Structure):
     """``Seen`` of ``picture.cpp``."""
 
     _fields_ = [
-        *fields("pos color normal screen depth hem faces face nearness around axes image own", POINTER),
+        *fields("pos color normal screen depth hem faces face nearness around axes own", POINTER),
         *fields("width height num_around", COUNT),
         ("eye", _TRIPLE),
         *fields("focal reach inside", REAL),
@@ -55,8 +55,8 @@ class FloorValues(ctypes.Structure):
     """``Floor`` of ``picture.cpp``."""
 
     _fields_ = [
-        *fields("dark image", POINTER),
-        *fields("width height cells samples", COUNT),
+        ("dark", POINTER),
+        *fields("width height cells", COUNT),
         *fields("eye right up forward center", _TRIPLE),
         *fields("tan_y floor cell", REAL),
         *fields("ground horizon zenith", _TRIPLE),
@@ -71,10 +71,8 @@ def library() -> ctypes.CDLL | None:
         return None
     lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 3, REAL, REAL, *[POINTER] * 2]
     lib.picture_lit.argtypes = [POINTER, POINTER, COUNT, REAL, POINTER]
-    lib.picture_shade.argtypes = [POINTER] * 2
-    lib.picture_backdrop.argtypes = [POINTER] * 2
-    lib.picture_resolve.argtypes = [POINTER, COUNT, COUNT, POINTER]
-    for name in ("picture_rasterise", "picture_lit", "picture_shade", "picture_backdrop", "picture_resolve"):
+    lib.picture_draw.argtypes = [POINTER] * 4
+    for name in ("picture_rasterise", "picture_lit", "picture_draw"):
         getattr(lib, name).restype = None
     return lib
 

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +27,7 @@ from hood.assets.files.said import install
 from hood.assets.formats.image import Texture
 from hood.media.renderer.camera import NEAR, Camera, unit
 from hood.media.renderer.raster import SeenValues, VisibilityBuffer, address, barycentric, library, packed, rasterise
-from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, openness
+from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
 from hood.mesh.topology import counted_edges
 
 _Array = NDArray[np.float64]
@@ -179,15 +180,19 @@ def render_frame(
     surface = _join(meshes)
     light = Light(camera, surface.pos, surface.faces)
     floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
-    image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
     firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
     prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
-    _draw_surface(image, camera, light, surface, prints)
+    view = _View.of(camera, surface, _SUPERSAMPLING * width, _SUPERSAMPLING * height)
     lib = library()
     if lib is not None:
-        picture = np.empty((height, width, 3), dtype=np.uint8)
-        lib.picture_resolve(address(image), width, height, address(picture))
+        dark, picture = dark_map(surface, floor_height), np.empty((height, width, 3), dtype=np.uint8)
+        floor_there = floor_values(camera, surface, floor_height, (width, height), dark)
+        seen, kept = _seen_values(camera, surface, view, prints)
+        lib.picture_draw(*(ctypes.byref(value) for value in (light.values(), seen, floor_there)), address(picture))
+        del kept  # until here
         return picture
+    image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
+    _draw_surface(image, camera, light, surface, view, prints)
     steps = range(_SUPERSAMPLING)
     samples = [image[i::_SUPERSAMPLING, j::_SUPERSAMPLING] for i in steps for j in steps]
     image = np.sum(samples, axis=0) / len(samples)
@@ -258,76 +263,93 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
+@dataclass(frozen=True)
+class _View:
+    """A surface as the camera sees it."""
+
+    number: NDArray[np.int64]  # (N,) of the faces that are not behind the camera
+    faces: NDArray[np.int64]  # (N, 3), these
+    screen: _Array  # (V, 2) pixels
+    depth: _Array  # (V,) m
+    buffer: VisibilityBuffer  # its faces are numbers of ``faces``
+    focal: float  # pixels that 1 m takes at a distance of 1 m
+
+    @classmethod
+    def of(cls, camera: Camera, surface: Surface, width: int, height: int) -> _View:
+        seen = (surface.pos - np.asarray(camera.position)) @ camera.axes().T
+        number = np.flatnonzero((seen[surface.faces, 2] > NEAR).all(axis=1))
+        faces, depth, focal = surface.faces[number], np.maximum(seen[:, 2], NEAR), camera.focal(height)
+        offset = focal * seen[:, :2] / depth[:, None]
+        screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
+        buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
+        return cls(number, faces, screen, depth, buffer, focal)
+
+    def first(self) -> NDArray[np.int64]:
+        """(H, W) number of the pixel that gives each pixel its colour: the first of its 2 x 2 that sees the same face."""
+        height, width = self.buffer.face.shape
+        four = self._fours(self.buffer.face)
+        first = (four[:, :, None] == four[:, None, :]).argmax(axis=2)
+        chosen = np.take_along_axis(self._fours(np.arange(height * width).reshape(height, width)), first, axis=1)
+        return np.asarray(chosen.reshape(height // 2, width // 2, 2, 2).swapaxes(1, 2).reshape(height, width))
+
+    @staticmethod
+    def _fours(values: NDArray[Any]) -> NDArray[Any]:
+        """(H W / 4, 4) of (H, W)."""
+        height, width = values.shape
+        return values.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
+
+    def covered(self) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.int64], _Array]:
+        """Row and column (P,) of the pixels that see a face and give it its colour, its corners (P, 3) and their shares
+        (P, 3)."""
+        own = self.first() == np.arange(self.buffer.face.size).reshape(self.buffer.face.shape)
+        row, column = np.nonzero((self.buffer.face >= 0) & own)
+        corners = self.faces[self.buffer.face[row, column]]
+        weights = barycentric(self.screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / self.depth[corners]
+        return row, column, corners, np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+
+
 def _draw_surface(
-    image: _Array, camera: Camera, light: Light, surface: Surface, prints: Sequence[tuple[int, Print]] = ()
+    image: _Array, camera: Camera, light: Light, surface: Surface, view: _View, prints: Sequence[tuple[int, Print]]
 ) -> None:
-    height, width = image.shape[:2]
-    axes = camera.axes()
-    seen = (surface.pos - np.asarray(camera.position)) @ axes.T
-    before = (seen[surface.faces, 2] > NEAR).all(axis=1)
-    faces = surface.faces[before]
-    depth = np.maximum(seen[:, 2], NEAR)
-    focal = camera.focal(height)
-    offset = focal * seen[:, :2] / depth[:, None]
-    screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
-    buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
-    visible = buffer.face
-    compiled, own = library() is not None, None
-    if compiled and not prints:
-        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), None)
-        return
-    row, column = np.nonzero(visible >= 0)
+    row, column, corners, weights = view.covered()
     if len(row) == 0:
         return
-    corners = faces[visible[row, column]]
-    weights = barycentric(screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / depth[corners]
-    weights = np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
-    if prints:
-        own = np.full(image.shape, np.nan)
-        own[row, column] = printed(prints, np.flatnonzero(before)[visible[row, column]], weights)
-    if compiled:
-        _shade_compiled(image, camera, light, replace(surface, faces=faces), (screen, depth, buffer), own)
-        return
-
+    axes, face = camera.axes(), view.buffer.face[row, column]
     pos = _blend(weights, surface.pos, corners)
     color = _blend(weights, surface.color, corners)
-    if own is not None:
-        color = np.where(np.isnan(own[row, column]), color, own[row, column])
+    if prints:
+        own = printed(prints, view.number[face], weights)
+        color = np.where(np.isnan(own), color, own)
     normal = unit(_blend(weights, surface.normal, corners))
-    view = unit(np.asarray(camera.position) - pos)
-    a, b, c = (screen[faces[:, k]] for k in range(3))
+    to_eye = unit(np.asarray(camera.position) - pos)
+    a, b, c = (view.screen[view.faces[:, k]] for k in range(3))
     turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    inside = turned[visible[row, column]]
+    inside = turned[face]
     normal[inside] *= -1.0
-    foot = np.asarray(1.0 / (focal * buffer.nearness[row, column]), dtype=np.float64)
+    foot = np.asarray(1.0 / (view.focal * view.buffer.nearness[row, column]), dtype=np.float64)
     color = np.where(inside[:, None], _INSIDE * color, color)
     color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
-    image[row, column] = light.shade(pos, normal, view, color, openness(buffer, focal, row, column, normal @ axes.T))
+    open_share = openness(view.buffer, view.focal, row, column, normal @ axes.T)
+    image[row, column] = light.shade(pos, normal, to_eye, color, open_share)
+    image[:] = np.where(view.buffer.face[..., None] >= 0, image.reshape(-1, 3)[view.first()], image)
 
 
-def _shade_compiled(
-    image: _Array,
-    camera: Camera,
-    light: Light,
-    surface: Surface,
-    view: tuple[_Array, _Array, VisibilityBuffer],
-    own: _Array | None,
-) -> None:
-    """The rest of :func:`_draw_surface` in C++, from a ``view``: pixels and depths of vertices, and what is seen; with colours
-    ``own`` (H, W, 3) of pixels instead of those of vertices, where they are not NaN."""
-    lib = library()
-    assert lib is not None
-    assert image.flags.c_contiguous
-    screen, depth, buffer = view
-    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, screen, depth, surface.hem)]
-    arrays += [packed(surface.faces, np.int64), packed(buffer.face, np.int32)]
-    arrays += [packed(value) for value in (buffer.nearness, AROUND, camera.axes())] + [image]
-    height, width = image.shape[:2]
+def _seen_values(
+    camera: Camera, surface: Surface, view: _View, prints: Sequence[tuple[int, Print]]
+) -> tuple[SeenValues, list[NDArray[np.generic]]]:
+    """What :func:`_draw_surface` needs, for the compiled drawing, and the arrays that it points to."""
+    height, width = view.buffer.face.shape
+    own = None
+    if prints:
+        row, column, _, weights = view.covered()
+        own = np.full((height, width, 3), np.nan)
+        own[row, column] = printed(prints, view.number[view.buffer.face[row, column]], weights)
+    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, view.screen, view.depth, surface.hem)]
+    arrays += [packed(view.faces, np.int64), packed(view.buffer.face, np.int32)]
+    arrays += [packed(value) for value in (view.buffer.nearness, AROUND, camera.axes())] + ([] if own is None else [own])
     eye = tuple(float(value) for value in camera.position)
-    sizes = width, height, AROUND.shape[1]
-    addresses = *(address(value) for value in arrays), None if own is None else address(own)
-    seen = SeenValues(*addresses, *sizes, eye, camera.focal(height), REACH, _INSIDE)
-    lib.picture_shade(ctypes.byref(light.values()), ctypes.byref(seen))
+    addresses = [*(address(value) for value in arrays), *([None] if own is None else [])]
+    return SeenValues(*addresses, width, height, AROUND.shape[1], eye, view.focal, REACH, _INSIDE), arrays
 
 
 def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:

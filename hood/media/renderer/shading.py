@@ -40,7 +40,7 @@ def openness(
 ) -> _Array:
     """Share (P,) of the light from all sides that reaches pixels: 1 in the open, less in creases and gaps.
 
-    Every pixel looks at a few others within :data:`REACH`, and counts how far what they see stands above its own tangent
+    Every pixel looks at a dozen others within :data:`REACH`, and counts how far what they see stands above its own tangent
     plane, less the farther it is (ambient occlusion in screen space, as Mittring, "Finding next gen", 2007, and McGuire et
     al., "The Alchemy screen-space ambient obscurance algorithm", 2011). What no pixel sees keeps no light off.
 
@@ -52,10 +52,11 @@ def openness(
     """
     height, width = buffer.face.shape
     pos = _positions(buffer, focal, row, column)
-    offset = AROUND[2 * (row % 2) + column % 2]
+    place = 2 * (row % 2) + column % 2
+    offset = np.concatenate([AROUND[place], AROUND[3 - place]], axis=1)
     reach = focal * REACH / pos[:, 2]
     kept = np.zeros(len(row))
-    for k in range(_COUNT):
+    for k in range(2 * _COUNT):
         c = np.floor(column + 0.5 + reach * offset[:, k, 0]).astype(np.int64)
         r = np.floor(row + 0.5 + reach * offset[:, k, 1]).astype(np.int64)
         at = np.flatnonzero((c >= 0) & (r >= 0) & (c < width) & (r < height))
@@ -65,7 +66,7 @@ def openness(
         share = np.maximum(1.0 - dist_sq / REACH**2, 0.0)
         above = np.einsum("pi,pi->p", normal[at], away) / np.sqrt(np.maximum(dist_sq, 1e-300))
         kept[at] += np.where(dist_sq > 0, np.maximum(above - _LEAST, 0.0) * share, 0.0)
-    return np.clip(1.0 - _STRENGTH * kept / _COUNT, _DARKEST, 1.0)
+    return np.clip(1.0 - _STRENGTH * kept / (2 * _COUNT), _DARKEST, 1.0)
 
 
 def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer]) -> _Array:
@@ -78,7 +79,7 @@ def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer],
 _Faces = NDArray[np.int64]
 
 _DARK_SIZE, _CELL = 128, 0.03  # cells of the map of shade on the floor along a side, and the side of one [m]
-_SHADOW_SIZE = 640  # pixels of the shadow map
+_SHADOW_SIZE, _TILE = 640, 16  # pixels of the shadow map, and of a tile of it
 # Where the shadow map is probed around a point, in texels: two rings, turned against each other.
 _PROBES = (
     (0.0, 0.0), (1.7, 0.6), (-0.6, 1.7), (-1.7, -0.6), (0.6, -1.7), (3.0, -2.4), (2.4, 3.0), (-3.0, 2.4),
@@ -107,6 +108,14 @@ class Surface:
     behind: _Array
 
 
+def _most_near(nearness: _Array) -> _Array:
+    """(H / 16, W / 16), the most of a map (H, W) in every tile and those around it."""
+    tiles = np.full([len(nearness) // _TILE + 2] * 2, -np.inf)
+    tiles[1:-1, 1:-1] = nearness.reshape(len(nearness) // _TILE, _TILE, -1, _TILE).max(axis=(1, 3))
+    rows = np.maximum(np.maximum(tiles[:-2], tiles[1:-1]), tiles[2:])
+    return packed(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))
+
+
 class Light:
     """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim."""
 
@@ -123,13 +132,14 @@ class Light:
         screen = (seen[:, :2] - self._low) * self._scale + 4.0
         self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE).nearness
         self._texel = 1.0 / self._scale
+        self._most = _most_near(self._map)
 
     def values(self) -> LightValues:
         """For the compiled drawing; valid as long as this light is."""
         size, low, count = _SHADOW_SIZE, (float(self._low[0]), float(self._low[1])), len(_PROBES)
         colors = (tuple(value) for value in (self.key, self.fill, _KEY, _FILL, _SKY, _BOUNCE))
-        at = (address(value) for value in (self._map, _PROBE_TEXELS, self._axes))
-        return LightValues(*at, size, count, low, self._scale, self._texel, *colors)
+        at = (address(value) for value in (self._map, self._most, _PROBE_TEXELS, self._axes))
+        return LightValues(*at, size, count, len(self._most), low, self._scale, self._texel, *colors)
 
     def lit(self, pos: _Array, spread: float = 1.0) -> _Array:
         """Share of the key light that reaches `pos` (P, 3): percentage-closer filtering of the shadow map."""
@@ -169,6 +179,15 @@ class Light:
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
 
 
+def floor_values(camera: Camera, surface: Surface, floor: float, size: tuple[int, int], dark: _Array) -> FloorValues:
+    """What :func:`backdrop` needs, for the compiled drawing of pictures of this ``size`` (width, height); ``dark`` is
+    :func:`dark_map`, and lives as long."""
+    where = (tuple(value) for value in (camera.position, *camera.axes(), _middle(surface)))
+    colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
+    tan_y = float(np.tan(np.radians(camera.fov) / 2))
+    return FloorValues(address(dark), *size, len(dark), *where, tan_y, floor, _CELL, *colors)
+
+
 def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> _Array:
     """Linear colours (samples * height, samples * width, 3) of the floor, which fades into a plain background.
 
@@ -176,15 +195,6 @@ def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width
     """
     right, up, forward = camera.axes()
     tan_y = np.tan(np.radians(camera.fov) / 2)
-    lib = library()
-    if lib is not None:
-        image, dark = np.empty((samples * height, samples * width, 3)), _dark_map(surface, floor)
-        where = (tuple(value) for value in (camera.position, right, up, forward, _middle(surface)))
-        colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
-        sizes = width, height, len(dark), samples
-        values = FloorValues(address(dark), address(image), *sizes, *where, tan_y, floor, _CELL, *colors)
-        lib.picture_backdrop(ctypes.byref(light.values()), ctypes.byref(values))
-        return image
     x = (np.arange(width) + 0.5 - 0.5 * width) / (0.5 * height) * tan_y
     y = (0.5 * height - np.arange(height) - 0.5) / (0.5 * height) * tan_y
     rays = forward + x[None, :, None] * right + y[:, None, None] * up
@@ -226,7 +236,7 @@ def _grid_lines(pos: _Array, pixel: _Array, stretch: _Array) -> _Array:
 
 def _floor_shadow(light: Light, surface: Surface, pos: _Array, floor: float, away: _Array) -> _Array:
     """What is left of the light on the floor: the cast shadow, and a soft dark patch under low parts."""
-    dark, center = _dark_map(surface, floor), _middle(surface)
+    dark, center = dark_map(surface, floor), _middle(surface)
     at = (pos[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2 - 0.5
     left = 1.0 - np.clip(_sample(dark, at), 0.0, 0.6)
     near = away < 3.0
@@ -234,7 +244,7 @@ def _floor_shadow(light: Light, surface: Surface, pos: _Array, floor: float, awa
     return left
 
 
-def _dark_map(surface: Surface, floor: float) -> _Array:
+def dark_map(surface: Surface, floor: float) -> _Array:
     """Shade under low parts, (_DARK_SIZE, _DARK_SIZE) cells of _CELL along z and x about the surface's middle."""
     center = _middle(surface)
     a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
@@ -244,7 +254,7 @@ def _dark_map(surface: Surface, floor: float) -> _Array:
     at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2, 0, _DARK_SIZE - 1).astype(np.int64)
     flat = np.bincount(at[:, 0] * _DARK_SIZE + at[:, 1], weights=weight, minlength=_DARK_SIZE * _DARK_SIZE)
     low = flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
-    return packed(0.55 * _blur(low, 1.4) + 0.6 * _blur(low, 4.0))
+    return packed(0.55 * (_NARROW @ low @ _NARROW) + 0.6 * (_BROAD @ low @ _BROAD))
 
 
 def _middle(surface: Surface) -> _Array:
@@ -253,14 +263,15 @@ def _middle(surface: Surface) -> _Array:
     return middle
 
 
-def _blur(image: _Array, sigma: float) -> _Array:
-    """Gaussian blur; the image is taken as zero outside."""
+def _blurring(sigma: float) -> _Array:
+    """Matrix (N, N) that blurs columns of the map by a Gaussian; beyond its rim the map is zero."""
     reach = int(3 * sigma + 0.5)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        image = np.apply_along_axis(np.convolve, axis, image, kernel, mode="same")
-    return image
+    away = np.arange(_DARK_SIZE) - np.arange(_DARK_SIZE)[:, None]
+    return np.where(np.abs(away) <= reach, np.exp(-0.5 * (away / sigma) ** 2) / kernel.sum(), 0.0)
+
+
+_NARROW, _BROAD = _blurring(1.4), _blurring(4.0)
 
 
 def _sample(image: _Array, at: _Array) -> _Array:
