@@ -130,7 +130,8 @@ def test_the_minimum_is_that_of_the_torch_form(make):
     problem = make()
     there, expected = minimize(default_potential(), problem, settings=replace(TORCH, target_rg=1e-6))
     here, report = minimize(default_potential(), problem, settings=replace(COMPILED, target_rg=1e-6))
-    assert report.converged.all() and expected.converged.all()
+    assert report.converged.all()
+    assert expected.converged.all()
     assert float((here - there).norm()) <= 1e-5 * float((there - problem.state.pos).norm())
     torch.testing.assert_close(report.phi, expected.phi, rtol=1e-9, atol=1e-12)
 

@@ -66,7 +66,9 @@ class _Engine(ctypes.Structure):
         *fields("num_walls num_grips num_points bending membrane", COUNT),
         ("dt_sq", REAL),
         *fields("pos acc trial_pos trial_acc gradient direction path face_force hinge_force", POINTER),
-        *fields("face_model hinge_model matrix indefinite_part own own_indefinite_part row_sum block inverse x r z p q", POINTER),
+        *fields(
+            "face_model hinge_model matrix indefinite_part own own_indefinite_part row_sum block inverse x r z p q", POINTER
+        ),
         *fields("indefinite_share raised phi noise slope", REAL),
         *fields("cg_used parts reach", COUNT),
         *fields("spill layers vertex_of_scene", POINTER),
