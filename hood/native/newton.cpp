@@ -64,7 +64,7 @@ struct Engine {
     const int32_t *face_corners, *hinge_corners;  // (3, F), (4, H)
     const int32_t *row_starts, *cols;             // (N + 1), (R) block rows and columns
     // Elements at a row's vertex, those with the most blocks in the row first: (C N + 1) starts for elements of C corners, with
-    // C, ..., 1 blocks; (., 2 + 2 C) element, corner, then corners and places in the row of its blocks, the diagonal first.
+    // C, ..., 1 blocks; (., 1 + C) 4 element + corner, then 4 place in the row + corner of its blocks, the diagonal first.
     const int32_t *face_starts, *face_uses, *hinge_starts, *hinge_uses, *spring_starts, *spring_uses;
     const int32_t* spring_ends;                   // (2, A)
     // The fabric: constant as long as the cloth's numbers.
@@ -103,7 +103,6 @@ struct Engine {
     int64_t cg_used;
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
-    void* spill;                    // (parts - 1, reach, 4) what a part's rows give to the rows behind the part
     // Cloth near cloth; none where there is no such term.
     LayerView* layers;
     const int64_t* vertex_of_scene;  // (V) number of each vertex in them
@@ -573,8 +572,8 @@ constexpr int PAIR[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
 template <int CORNERS> inline D4 pull_of(const double* forces, int size, const int32_t* starts, const int32_t* uses, int64_t row) {
     D4 sum = D4{};
     for (int64_t i = starts[CORNERS * row]; i < starts[CORNERS * (row + 1)]; ++i) {
-        const int32_t* use = uses + (2 + 2 * CORNERS) * i;
-        sum += load<D4>(forces + size * (int64_t)use[0] + 3 * use[1]);
+        const int32_t use = uses[(1 + CORNERS) * i];
+        sum += load<D4>(forces + size * (int64_t)(use >> 2) + 3 * (use & 3));
     }
     return sum;
 }
@@ -593,7 +592,7 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
         if (e.membrane) force += pull_of<3>(e.face_force, 10, e.face_starts, e.face_uses, row);
         if (e.bending) force += pull_of<4>(e.hinge_force, 14, e.hinge_starts, e.hinge_uses, row);
         for (int64_t i = e.spring_starts[2 * row]; i < e.spring_starts[2 * (row + 1)]; ++i) {
-            const int64_t spring = e.spring_uses[6 * i], corner = e.spring_uses[6 * i + 1];
+            const int64_t spring = e.spring_uses[3 * i] >> 2, corner = e.spring_uses[3 * i] & 3;
             const int64_t here = e.spring_ends[corner * e.num_springs + spring];
             const int64_t there = e.spring_ends[(1 - corner) * e.num_springs + spring];
             const D4 gap = load<D4>(e.pos + 4 * here) - load<D4>(e.pos + 4 * there), target = load<D4>(e.spring_target + 4 * spring);
@@ -613,13 +612,13 @@ template <class T> struct Row {
 template <class T, int BLOCKS> inline void add_faces(const Engine& e, int64_t from, int64_t to, Row<T>& row) {
     typedef typename Four<T>::type V4;
     for (int64_t i = from; i < to; ++i) {
-        const int32_t* use = e.face_uses + 8 * i;
-        const FaceRecord<T>& face = ((const FaceRecord<T>*)e.face_model)[use[0]];
-        const int c = use[1];
+        const int32_t* use = e.face_uses + 4 * i;
+        const FaceRecord<T>& face = ((const FaceRecord<T>*)e.face_model)[use[0] >> 2];
+        const int c = use[0] & 3;
         const T* own = face.root + 3 * c;
         for (int b = 0; b < BLOCKS; ++b) {
-            const int d = use[2 + 2 * b];
-            const int64_t place = use[3 + 2 * b];
+            const int d = use[1 + b] & 3;
+            const int64_t place = use[1 + b] >> 2;
             const T* other = face.root + 3 * d;
             const V4 first = load<V4>(other), second = load<V4>(other + 9), third = load<V4>(other + 18);
             V4* target = row.block + 3 * place;
@@ -632,12 +631,12 @@ template <class T, int BLOCKS> inline void add_faces(const Engine& e, int64_t fr
 template <class T, int BLOCKS> inline void add_hinges(const Engine& e, int64_t from, int64_t to, Row<T>& row) {
     typedef typename Four<T>::type V4;
     for (int64_t i = from; i < to; ++i) {
-        const int32_t* use = e.hinge_uses + 10 * i;
-        const HingeRecord<T>& hinge = ((const HingeRecord<T>*)e.hinge_model)[use[0]];
-        const T* own = hinge.row + 3 * use[1];
+        const int32_t* use = e.hinge_uses + 5 * i;
+        const HingeRecord<T>& hinge = ((const HingeRecord<T>*)e.hinge_model)[use[0] >> 2];
+        const T* own = hinge.row + 3 * (use[0] & 3);
         for (int b = 0; b < BLOCKS; ++b) {
-            const V4 other = load<V4>(hinge.row + 3 * use[2 + 2 * b]);
-            V4* target = row.block + 3 * (int64_t)use[3 + 2 * b];
+            const V4 other = load<V4>(hinge.row + 3 * (use[1 + b] & 3));
+            V4* target = row.block + 3 * (int64_t)(use[1 + b] >> 2);
             for (int k = 0; k < 3; ++k) target[k] += own[k] * other;
         }
     }
@@ -693,10 +692,10 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
             add_hinges<T, 1>(e, starts[3], starts[4], sum);
         }
         for (int64_t i = e.spring_starts[2 * row]; i < e.spring_starts[2 * (row + 1)]; ++i) {
-            const int32_t* use = e.spring_uses + 6 * i;
-            const T stiffness = (T)e.spring_stiffness[use[0]];
+            const int32_t* use = e.spring_uses + 3 * i;
+            const T stiffness = (T)e.spring_stiffness[use[0] >> 2];
             sum.axial[0] += V4{stiffness, T(0), T(0), T(0)};
-            if (i < e.spring_starts[2 * row + 1]) sum.axial[use[5]] += V4{-stiffness, T(0), T(0), T(0)};
+            if (i < e.spring_starts[2 * row + 1]) sum.axial[use[2] >> 2] += V4{-stiffness, T(0), T(0), T(0)};
         }
         couple_points(e, row, [&](int32_t place, double factor, const double* m, const double* less) {
             for (int k = 0; k < 3; ++k)
@@ -818,10 +817,6 @@ template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range ran
     return sum;
 }
 
-inline Range behind(const Engine& e, Range range) { return {range.end, std::min(range.end + e.reach, e.num_rows)}; }
-
-template <class T> inline T* spill_of(const Engine& e, int64_t part) { return (T*)e.spill + 4 * e.reach * part; }
-
 template <class T> void sweep_back(const Engine& e, int64_t part, T share) {
     const Range range = rows_of(e, part);
     const int64_t inside = e.parts == 1 ? range.end : std::max(range.begin, range.end - e.reach);
@@ -829,38 +824,27 @@ template <class T> void sweep_back(const Engine& e, int64_t part, T share) {
     sweep_back<T, true>(e, {range.begin, inside}, range.end, share);
 }
 
-// Adds to q what the blocks between a part and the rows behind it make of p; for those rows it is put aside: ``spill`` has ``reach``
-// rows of them.
-template <class T> void couple_part(const Engine& e, int64_t part) {
+// Adds to q of a part what the blocks between it and other parts make of p.
+template <class T> void couple_part(const Engine& e, Range range) {
     typedef typename Four<T>::type V4;
-    const Range range = rows_of(e, part), rest = behind(e, range);
-    if (rest.begin == rest.end) return;
-    T *q = (T*)e.q, *spill = spill_of<T>(e, part);
+    T* q = (T*)e.q;
     const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
-    std::memset(spill, 0, sizeof(T) * 4 * (rest.end - rest.begin));
-    for (int64_t row = std::max(range.begin, range.end - e.reach); row < range.end; ++row) {
+    for (int64_t row = std::max<int64_t>(range.begin - e.reach, 0); row < range.begin; ++row) {
         const V4 own = load<V4>(p + 4 * row);
-        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.end; --i) {
+        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.begin; --i) {
+            if (e.cols[i] >= range.end) continue;
             const T* m = matrix + 9 * (int64_t)i;
-            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6), other = load<V4>(p + 4 * (int64_t)e.cols[i]);
-            const V4 a = first * other, b = second * other, c = third * other;
-            store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
-            T* target = spill + 4 * (e.cols[i] - range.end);
-            store(target, load<V4>(target) + first * own[0] + second * own[1] + third * own[2]);
+            T* target = q + 4 * (int64_t)e.cols[i];
+            store(target, load<V4>(target) + load<V4>(m) * own[0] + load<V4>(m + 3) * own[1] + load<V4>(m + 6) * own[2]);
         }
     }
-}
-
-// Adds to the rows of a part what earlier parts have put aside for them.
-template <class T> void take_spill(const Engine& e, int64_t part, T* q) {
-    typedef typename Four<T>::type V4;
-    const Range own = rows_of(e, part);
-    for (int64_t other = 0; other < part; ++other) {
-        const Range rest = behind(e, rows_of(e, other));
-        const T* spill = spill_of<T>(e, other) - 4 * rest.begin;
-        for (int64_t row = std::max(own.begin, rest.begin); row < std::min(own.end, rest.end); ++row)
-            store(q + 4 * row, load<V4>(q + 4 * row) + load<V4>(spill + 4 * row));
-    }
+    for (int64_t row = std::max(range.begin, range.end - e.reach); row < range.end; ++row)
+        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.end; --i) {
+            const T* m = matrix + 9 * (int64_t)i;
+            const V4 other = load<V4>(p + 4 * (int64_t)e.cols[i]);
+            const V4 a = load<V4>(m) * other, b = load<V4>(m + 3) * other, c = load<V4>(m + 6) * other;
+            store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+        }
 }
 
 // z = B r of the rows of a part, in the place of q; r . z.
@@ -914,12 +898,12 @@ template <class Compute> inline double sum_parts(const Engine& e, const Compute&
 // q = H' p' for p' = z + share p'; their product.
 template <class T> double multiply(const Engine& e, T share) {
     for_parts(e.parts, [&](int64_t part) { sweep_back<T>(e, part, share); });
-    if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, part); });
     if (near_layers(e)) couple_layers<T>(e);
     if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
     return sum_parts(e, [&](int64_t part) {
-        take_spill<T>(e, part, (T*)e.q);
-        return sweep_on<T, false>(e, rows_of(e, part));
+        const Range range = rows_of(e, part);
+        if (e.parts > 1) couple_part<T>(e, range);
+        return sweep_on<T, false>(e, range);
     });
 }
 
@@ -1266,9 +1250,9 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
         for (int k = 0; k < 6; ++k) upper[k] = blocks[k];
         if (e->membrane)
             for (int64_t i = e->face_starts[3 * row]; i < e->face_starts[3 * (row + 1)]; ++i) {
-                const int32_t* use = e->face_uses + 8 * i;
-                const FaceRecord<Real>& face = ((const FaceRecord<Real>*)e->face_model)[use[0]];
-                const int c = use[1];
+                const int32_t use = e->face_uses[4 * i];
+                const FaceRecord<Real>& face = ((const FaceRecord<Real>*)e->face_model)[use >> 2];
+                const int c = use & 3;
                 for (int m = 0; m < 3; ++m) {
                     const Real* root = face.root + 9 * m + 3 * c;
                     const double own[3] = {root[0], root[1], root[2]};
@@ -1278,13 +1262,13 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
             }
         if (e->bending)
             for (int64_t i = e->hinge_starts[4 * row]; i < e->hinge_starts[4 * (row + 1)]; ++i) {
-                const int32_t* use = e->hinge_uses + 10 * i;
-                const Real* of = ((const HingeRecord<Real>*)e->hinge_model)[use[0]].row + 3 * use[1];
+                const int32_t use = e->hinge_uses[5 * i];
+                const Real* of = ((const HingeRecord<Real>*)e->hinge_model)[use >> 2].row + 3 * (use & 3);
                 const double own[3] = {of[0], of[1], of[2]};
                 add_outer(upper, 1.0, own);
             }
         for (int64_t i = e->spring_starts[2 * row]; i < e->spring_starts[2 * (row + 1)]; ++i)
-            for (int k = 0; k < 3; ++k) upper[DIAGONAL[k]] += e->spring_stiffness[e->spring_uses[6 * i]];
+            for (int k = 0; k < 3; ++k) upper[DIAGONAL[k]] += e->spring_stiffness[e->spring_uses[3 * i] >> 2];
         const int64_t v = e->vertex[row];
         const double pull[3] = {-e->gradient[4 * row], -e->gradient[4 * row + 1], -e->gradient[4 * row + 2]};
         double moved[3];

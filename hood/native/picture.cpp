@@ -307,6 +307,7 @@ struct Shown {
     uint8_t operator()(double color) const {
         const double shown = clip(color, 0.0, 1.0);
         int k = guess[(int)(1024.0 * shown)];
+        k += least[k + 1] <= shown;  // without a branch: rarely is there more than one between two entries
         while (least[k + 1] <= shown) ++k;
         return (uint8_t)k;
     }

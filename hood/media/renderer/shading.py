@@ -111,7 +111,8 @@ class Surface:
 def _most_near(nearness: _Array) -> _Array:
     """(H / 16, W / 16), the most of a map (H, W) in every tile and those around it."""
     tiles = np.full([len(nearness) // _TILE + 2] * 2, -np.inf)
-    tiles[1:-1, 1:-1] = nearness.reshape(len(nearness) // _TILE, _TILE, -1, _TILE).max(axis=(1, 3))
+    rows = nearness.reshape(-1, _TILE, len(nearness)).max(axis=1)
+    tiles[1:-1, 1:-1] = rows.reshape(len(rows), -1, _TILE).max(axis=2)
     rows = np.maximum(np.maximum(tiles[:-2], tiles[1:-1]), tiles[2:])
     return packed(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))
 

@@ -71,7 +71,7 @@ class _Engine(ctypes.Structure):
         ),
         *fields("indefinite_share raised phi noise slope", REAL),
         *fields("cg_used parts reach", COUNT),
-        *fields("spill layers vertex_of_scene", POINTER),
+        *fields("layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
         *fields("layer_grips others", POINTER),
     ]

@@ -108,7 +108,6 @@ class CompiledScene:
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
-        memory["spill"] = _aligned(4 * values.reach * (values.parts - 1), kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(), np.uint8)
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(), np.uint8)
         return memory

@@ -27,7 +27,7 @@ class Elements:
     order: np.ndarray  # (N,) elements of the cloth, in the new order
     corners: np.ndarray  # (C, P) int32 vertices of the padded elements
     starts: np.ndarray  # (R C + 1,) int32, where the uses of a row with C, ..., 1 blocks there begin
-    uses: np.ndarray  # (U, 2 + 2 C) int32: element, corner, then corner and place in the row of every block, the diagonal first
+    uses: np.ndarray  # (U, 1 + C) int32: 4 element + corner, then 4 place in the row + corner of every block, the diagonal first
 
     def padded(self, values: np.ndarray, padding: float = 0.0) -> np.ndarray:
         """Numbers (..., elements of the cloth) in the new order (..., P), float64."""
@@ -150,8 +150,8 @@ def _elements(chosen: np.ndarray, corners: np.ndarray, keys: np.ndarray, starts:
 
 
 def _uses(corners: np.ndarray, corner: int, keys: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Row, number of blocks and use (U, 2 + 2 + 2 C) of the elements whose ``corner`` is free, one for each."""
-    size, width = len(starts) - 1, corners.shape[1]
+    """Row, number of blocks and use (U, 2 + 1 + C) of the elements whose ``corner`` is free, one for each."""
+    size = len(starts) - 1
     element = np.flatnonzero(corners[:, corner] < size)
     row, cols = corners[element, corner], corners[element]
     # Blocks of earlier columns are kept by their rows, fixed corners have none; they come last and are not read.
@@ -159,5 +159,4 @@ def _uses(corners: np.ndarray, corner: int, keys: np.ndarray, starts: np.ndarray
     others = np.argsort(np.where(upper, cols, size), axis=1, kind="stable")
     cols = np.take_along_axis(np.where(upper, cols, row[:, None]), others, axis=1)
     places = np.searchsorted(keys, row[:, None] * size + cols) - starts[row][:, None]
-    blocks = np.stack([others, places], axis=2).reshape(len(element), 2 * width)
-    return np.concatenate([np.stack([row, upper.sum(axis=1), element, np.full(len(row), corner)], axis=1), blocks], axis=1)
+    return np.concatenate([np.stack([row, upper.sum(axis=1), 4 * element + corner], axis=1), 4 * places + others], axis=1)
