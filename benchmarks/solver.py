@@ -12,7 +12,7 @@ the run went: frames not converged, frames whose starts disagree, steps of risin
 
 OpenBLAS has threads of its own: without OMP_NUM_THREADS=1 the direct solver takes ten times as long on a busy machine.
 
-Why block-Jacobi. The levels of :mod:`hood.model.graph.hierarchy` were tried as a second preconditioner: interpolation from kept
+Why no levels. Those of :mod:`hood.model.graph.hierarchy` were tried as a second preconditioner: interpolation from kept
 vertices to their dropped neighbours, Galerkin matrices, the coarsest factorised, added to block-Jacobi or in a V-cycle with
 one damped block-Jacobi step before and after. On Newton systems of this drape, mean over 4 to 14 systems, one thread of an
 AMD server CPU, to a tenth of the residual, iterations and ms without the set-up (which took 16, 99 and 1,028 ms):
@@ -23,7 +23,8 @@ AMD server CPU, to a tenth of the residual, iterations and ms without the set-up
     V-cycle         5.3, 3.1       13, 45         14, 256
 
 Breadth-first parity keeps every second ring, so the coarse matrix is as large as a quarter of the fine one and denser;
-that costs more than the iterations it saves, at every size and also to a thousandth of the residual.
+that costs more than the iterations it saves, at every size and also to a thousandth of the residual. For aggregates with
+rigid motions see ``benchmarks/preconditioners.py``.
 """
 
 from __future__ import annotations

@@ -99,7 +99,6 @@ struct Engine {
     void *block, *inverse, *x, *r, *z, *p, *q; // (N, 12) twice, (N, 4) five times
     double indefinite_share, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
-    double slope;  // J, of the potential along the last move, at its start
     int64_t cg_used;
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
@@ -1086,7 +1085,6 @@ void take_trial(Engine& e, double phi, double noise) {
 bool backtrack(Engine& e) {
     double slope = 0.0, length = 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row) slope += dot3(e.gradient + 4 * row, e.direction + 4 * row);
-    e.slope = slope;
     if (!(slope < 0.0)) return false;
     for (int attempt = 0; attempt < 40; ++attempt) {
         double phi, noise;

@@ -41,8 +41,8 @@ class NewtonSettings:
         target_rg: relative gradient to reach, see :func:`hood.energies.potential.relative_gradient`.
         max_iterations: Newton iterations; ordinary steps take about 10, those of cloth a thousand times stiffer about 100.
         budget_ms: stop after the iteration that passes this time [ms]; None for no limit.
-        linear: ``cg`` (conjugate gradients, block-Jacobi) or ``direct`` (band Cholesky, on the CPU). A Newton
-            iteration with the latter takes twice the time at 1,000 vertices and three times at 4,000, for a tenth fewer.
+        linear: ``cg`` (conjugate gradients, preconditioned by Gauss-Seidel sweeps, in torch by blocks) or ``direct`` (band
+            Cholesky, in torch, on the CPU).
         cg_iterations: at most as many per Newton iteration. Ordinary cloth takes as many Newton iterations with 100. Of cloth a
             thousand times stiffer, most steps miss the target with 100.
         double: compute in float64 whatever the problem's type. In float32 the potential of a garment is known to

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from hood.media.renderer.camera import Camera, unit, view_axes
 from hood.media.renderer.raster import FloorValues, LightValues, VisibilityBuffer, address, library, packed, rasterise
@@ -255,24 +256,14 @@ def dark_map(surface: Surface, floor: float) -> _Array:
     at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2, 0, _DARK_SIZE - 1).astype(np.int64)
     flat = np.bincount(at[:, 0] * _DARK_SIZE + at[:, 1], weights=weight, minlength=_DARK_SIZE * _DARK_SIZE)
     low = flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
-    return packed(0.55 * (_NARROW @ low @ _NARROW) + 0.6 * (_BROAD @ low @ _BROAD))
+    narrow, broad = (gaussian_filter(low, sigma, mode="constant", truncate=3.0) for sigma in (1.4, 4.0))
+    return packed(0.55 * narrow + 0.6 * broad)
 
 
 def _middle(surface: Surface) -> _Array:
     """Of the box that holds the surface, (3,)."""
     middle: _Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
     return middle
-
-
-def _blurring(sigma: float) -> _Array:
-    """Matrix (N, N) that blurs columns of the map by a Gaussian; beyond its rim the map is zero."""
-    reach = int(3 * sigma + 0.5)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    away = np.arange(_DARK_SIZE) - np.arange(_DARK_SIZE)[:, None]
-    return np.where(np.abs(away) <= reach, np.exp(-0.5 * (away / sigma) ** 2) / kernel.sum(), 0.0)
-
-
-_NARROW, _BROAD = _blurring(1.4), _blurring(4.0)
 
 
 def _sample(image: _Array, at: _Array) -> _Array:

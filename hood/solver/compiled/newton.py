@@ -1,6 +1,7 @@
 """The compiled form of Newton's method: ``hood/native/newton.cpp`` with the arrays it works on.
 
-The same potential, the same rules as the torch form (:mod:`hood.solver.newton`), which stays the reference. Energies and
+The same potential, the same rules as the torch form (:mod:`hood.solver.newton`), which stays the reference, but for the
+preconditioner of conjugate gradients: sweeps, which vertices take one after the other, have no form in torch. Energies and
 gradients are float64; the matrix and the linear solver are float32, and float64 from where a step in float32 leads nowhere.
 """
 
@@ -69,7 +70,7 @@ class _Engine(ctypes.Structure):
         *fields(
             "face_model hinge_model matrix indefinite_part own own_indefinite_part row_sum block inverse x r z p q", POINTER
         ),
-        *fields("indefinite_share raised phi noise slope", REAL),
+        *fields("indefinite_share raised phi noise", REAL),
         *fields("cg_used parts reach", COUNT),
         *fields("layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),

@@ -27,7 +27,9 @@ class Elements:
     order: np.ndarray  # (N,) elements of the cloth, in the new order
     corners: np.ndarray  # (C, P) int32 vertices of the padded elements
     starts: np.ndarray  # (R C + 1,) int32, where the uses of a row with C, ..., 1 blocks there begin
-    uses: np.ndarray  # (U, 1 + C) int32: 4 element + corner, then 4 place in the row + corner of every block, the diagonal first
+    uses: (
+        np.ndarray
+    )  # (U, 1 + C) int32: 4 element + corner, then 4 place in the row + corner of every block, the diagonal first
 
     def padded(self, values: np.ndarray, padding: float = 0.0) -> np.ndarray:
         """Numbers (..., elements of the cloth) in the new order (..., P), float64."""
