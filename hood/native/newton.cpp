@@ -906,13 +906,23 @@ template <class T> double multiply(const Engine& e, T share) {
     });
 }
 
+// What the right-hand side is multiplied by: its norm becomes 1, nothing overflows in float32.
+inline double right_scale(const Engine& e) {
+    double norm = 0.0;
+    for (int64_t row = 0; row < e.num_rows; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
+    return norm > 0.0 ? 1.0 / std::sqrt(norm) : 0.0;
+}
+
+template <class T> void read_direction(const Engine& e, double scale) {
+    const T* x = (const T*)e.x;
+    const double size = scale > 0.0 ? 1.0 / scale : 0.0;
+    for (int64_t row = 0; row < e.num_rows; ++row)
+        for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = size * (double)x[4 * row + k];
+}
+
 // Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
 template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
-    const int64_t size = e.num_rows;
-    double norm = 0.0;  // the right-hand side is scaled to 1: nothing overflows in float32
-    for (int64_t row = 0; row < size; ++row) norm += dot3(e.gradient + 4 * row, e.gradient + 4 * row);
-    norm = std::sqrt(norm);
-    const double scale = norm > 0.0 ? 1.0 / norm : 0.0;
+    const double scale = right_scale(e);
     double rz = sum_parts(e, [&](int64_t part) { return begin_rows<T>(e, part, scale); });
     const double limit = tolerance * tolerance * rz;
     T share = T(0);
@@ -929,10 +939,75 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
         share = (T)(rz / before);
         ++e.cg_used;
     }
-    const T* x = (const T*)e.x;
-    for (int64_t row = 0; row < size; ++row)
-        for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = norm * (double)x[4 * row + k];
+    read_direction<T>(e, scale);
     return definite;
+}
+
+// q = H p of a part, without what couples it to other parts.
+template <class T> void multiply_part(const Engine& e, Range range) {
+    typedef typename Four<T>::type V4;
+    const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
+    T* q = (T*)e.q;
+    std::memset(q + 4 * range.begin, 0, sizeof(T) * 4 * (range.end - range.begin));
+    for (int64_t row = range.begin; row < range.end; ++row) {
+        const T* m = matrix + 9 * (int64_t)e.row_starts[row];
+        const V4 own = load<V4>(p + 4 * row);
+        V4 a = load<V4>(m) * own, b = load<V4>(m + 3) * own, c = load<V4>(m + 6) * own;
+        for (int32_t i = e.row_starts[row] + 1; i < e.row_starts[row + 1] && e.cols[i] < range.end; ++i) {
+            m += 9;
+            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6), other = load<V4>(p + 4 * (int64_t)e.cols[i]);
+            T* target = q + 4 * (int64_t)e.cols[i];
+            a += first * other, b += second * other, c += third * other;
+            store(target, load<V4>(target) + first * own[0] + second * own[1] + third * own[2]);
+        }
+        store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+    }
+}
+
+// So many iterations with the blocks of the diagonal as preconditioner, as hood.solver.vertex.cg_step: networks are trained with
+// what so many lead to.
+template <class T> void solve_by_blocks(Engine& e, int64_t most) {
+    typedef typename Four<T>::type V4;
+    T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p, *q = (T*)e.q;
+    const double scale = right_scale(e);
+    const auto sum_rows = [&](const auto& compute) {
+        return sum_parts(e, [&](int64_t part) {
+            D4 sum = D4{};
+            const Range range = rows_of(e, part);
+            for (int64_t row = range.begin; row < range.end; ++row) sum += compute(row);
+            return sum;
+        });
+    };
+    const auto precondition = [&](int64_t row, V4 left) {
+        const V4 result = by_block<T>((const T*)e.inverse + 12 * row, left);
+        store(r + 4 * row, left), store(z + 4 * row, result);
+        return __builtin_convertvector(result * left, D4);
+    };
+    double rz = sum_rows([&](int64_t row) {
+        const D4 sum = precondition(row, __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
+        store(x + 4 * row, V4{}), store(p + 4 * row, load<V4>(z + 4 * row));
+        return sum;
+    });
+    for (int64_t iteration = 0; iteration < most && rz > 0.0; ++iteration) {
+        for_parts(e.parts, [&](int64_t part) { multiply_part<T>(e, rows_of(e, part)); });
+        if (near_layers(e)) couple_layers<T>(e);
+        if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, rows_of(e, part)); });
+        const double curvature = sum_rows([&](int64_t row) { return __builtin_convertvector(load<V4>(p + 4 * row) * load<V4>(q + 4 * row), D4); });
+        if (!(curvature > 0.0)) break;
+        const T length = (T)(rz / curvature);
+        const double before = rz;
+        rz = sum_rows([&](int64_t row) {
+            store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
+            return precondition(row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
+        });
+        const T share = (T)(rz / before);
+        sum_rows([&](int64_t row) {
+            store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
+            return D4{};
+        });
+        ++e.cg_used;
+    }
+    read_direction<T>(e, scale);
 }
 
 // As much of the indefinite part as the system bears, see hood.solver.system.linear.Directions.
@@ -1292,7 +1367,7 @@ void newton_together(Engine* e, const float* force, const float* damping, int64_
                             V4{block[6], block[7], block[8], Real(0)}};
         invert<Real>(rows, (Real*)e->block + 12 * row, (Real*)e->inverse + 12 * row);
     }
-    solve<Real>(*e, 0.0, iterations);
+    solve_by_blocks<Real>(*e, iterations);
     for (int64_t row = 0; row < e->num_rows; ++row)
         for (int k = 0; k < 3; ++k) step[3 * e->vertex[row] + k] = (float)e->direction[4 * row + k];
 }

@@ -50,7 +50,7 @@ RUN = (
         (r"docs/images/", ""),
     ),
     Run(r"/distance\.py", "--garments tank --frames 2", r"tank", slow=True),
-    Run(r"engine\.py$", "--iterations 1 --frames 2", r"2 of 2", (r"$", " tank")),
+    Run(r"engine\.py$", "--iterations 20 --frames 2", r"2 of 2", (r"$", " tank")),
     Run(
         r"engine\.py --frame",
         "--iterations 1 --frames 3 --motions plie",
@@ -93,6 +93,8 @@ RUN = (
     ),
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
+    Run(r"preconditioners\.py$", "--frames 7", r"tank +\d.*×", (r"$", " tank")),
+    Run(r"preconditioners\.py dress", "", "", (r"dress.*", "tank --frames 7")),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
     Run(
         r"levels\.py", "--garments tank_4k --sequences plie --frames 3", r"mesh tank(.|\n)*60 fps(.|\n)*of 1 meshes", slow=True

@@ -89,7 +89,7 @@ REFUSED: dict[str, Scene] = {
 FAST = (
     "curtain_row", "tank_mannequin", "tshirt_lying_belly", "dress_3m_up", "trousers_handstand", "cape_pinned",
     "tank_walk_edges", "dress_slim", "trousers_denim", "skirt_disco",
-    "spear_through_sheet", "tshirt_walk_untrained_paper", "dress_walk_guess", "armband", "dress_walk_newton1",
+    "spear_through_sheet", "tshirt_walk_untrained_paper", "dress_walk_guess", "armband", "trousers_kicks_newton1",
     "tshirt_jumps_ours", "cape_not_pinned", "tank_soft_contact", "dress_skirt_off", "tshirt_trousers_off",
 )  # fmt: skip
 
