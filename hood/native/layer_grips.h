@@ -68,7 +68,7 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
 }
 
 // Adds what pairs bring beside the diagonal blocks, with a share of the indefinite part, to q = H p: all that they bring, less those blocks.
-// Returns their p . q. Vertices from num_rows on do not move.
+// Vertices from num_rows on do not move.
 template <class T> void couple_layer_grips(const LayerGrips& g, int64_t num_rows, double indefinite_share, const T* p, T* q) {
     for (int64_t i = 0; i < g.count; ++i) {
         const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, *weights = g.weights + 4 * i;
