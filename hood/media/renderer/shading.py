@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from hood.media.renderer.camera import Camera, unit, view_axes
-from hood.media.renderer.raster import FloorValues, LightValues, VisibilityBuffer, address, library, packed, rasterise
+from hood.media.renderer.raster import (
+    FloatArray,
+    FloorValues,
+    LightValues,
+    VisibilityBuffer,
+    address,
+    library,
+    packed,
+    rasterise,
+)
 
 _Array = NDArray[np.float64]
 
@@ -109,7 +118,7 @@ class Surface:
     behind: _Array
 
 
-def _most_near(nearness: _Array) -> _Array:
+def _most_near(nearness: FloatArray) -> _Array:
     """(H / 16, W / 16), the most of a map (H, W) in every tile and those around it."""
     tiles = np.full([len(nearness) // _TILE + 2] * 2, -np.inf)
     rows = nearness.reshape(-1, _TILE, len(nearness)).max(axis=1)
