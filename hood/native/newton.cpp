@@ -894,11 +894,16 @@ template <class Compute> inline double sum_parts(const Engine& e, const Compute&
     return (sum[0] + sum[1]) + sum[2];
 }
 
+// Adds to q what cloth near cloth makes of p beside the blocks.
+template <class T> void couple_cloth(const Engine& e) {
+    if (near_layers(e)) couple_layers<T>(e);
+    if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
+}
+
 // q = H' p' for p' = z + share p'; their product.
 template <class T> double multiply(const Engine& e, T share) {
     for_parts(e.parts, [&](int64_t part) { sweep_back<T>(e, part, share); });
-    if (near_layers(e)) couple_layers<T>(e);
-    if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
+    couple_cloth<T>(e);
     return sum_parts(e, [&](int64_t part) {
         const Range range = rows_of(e, part);
         if (e.parts > 1) couple_part<T>(e, range);
@@ -990,7 +995,7 @@ template <class T> void solve_by_blocks(Engine& e, int64_t most) {
     });
     for (int64_t iteration = 0; iteration < most && rz > 0.0; ++iteration) {
         for_parts(e.parts, [&](int64_t part) { multiply_part<T>(e, rows_of(e, part)); });
-        if (near_layers(e)) couple_layers<T>(e);
+        couple_cloth<T>(e);
         if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, rows_of(e, part)); });
         const double curvature = sum_rows([&](int64_t row) { return __builtin_convertvector(load<V4>(p + 4 * row) * load<V4>(q + 4 * row), D4); });
         if (!(curvature > 0.0)) break;
@@ -1011,11 +1016,9 @@ template <class T> void solve_by_blocks(Engine& e, int64_t most) {
 }
 
 // As much of the indefinite part as the system bears, see hood.solver.system.linear.Directions.
-template <class T> void direct(Engine& e, double residual, int64_t most) {
+template <class T> void direct(Engine& e, double tolerance, int64_t most) {
     e.indefinite_share = e.raised;
     gather_matrix<T>(e);
-    double tolerance = std::sqrt(residual);
-    tolerance = tolerance < 1e-3 ? 1e-3 : tolerance > 0.1 ? 0.1 : tolerance;
     double indefinite_share = e.raised;
     bool halved = false;
     while (true) {
@@ -1283,9 +1286,9 @@ void newton_matrix(Engine* e, double indefinite_share) {
     gather_matrix<Real>(*e);
 }
 
-// From the model to the next state; 1 where it moved.
-int64_t newton_move(Engine* e, double residual, int64_t cg_iterations) {
-    direct<Real>(*e, residual, cg_iterations);
+// From the model to the next state, by a linear system that is solved to a tolerance; 1 where it moved.
+int64_t newton_move(Engine* e, double tolerance, int64_t cg_iterations) {
+    direct<Real>(*e, tolerance, cg_iterations);
     prepare_path<Real>(*e);
     return backtrack(*e);
 }

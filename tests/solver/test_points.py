@@ -139,8 +139,8 @@ def test_iterations_are_those_of_the_torch_form(place: str) -> None:
     for count in range(5):
         there, expected = after(potential, problem, TORCH, count)
         here, phi = after(potential, problem, COMPILED, count)
-        assert float((here - there).norm()) <= 5e-2 * float((there - problem.state.pos).norm())
-        assert phi == pytest.approx(expected, rel=2e-2, abs=1e-6)
+        assert float((here - there).norm()) <= 1e-4 * float((there - problem.state.pos).norm())
+        assert phi == pytest.approx(expected, rel=1e-5, abs=1e-9)
 
 
 @pytest.mark.usefixtures("compiled_solver")

@@ -187,9 +187,8 @@ def render_frame(
     if lib is not None:
         dark, picture = dark_map(surface, floor_height), np.empty((height, width, 3), dtype=np.uint8)
         floor_there = floor_values(camera, surface, floor_height, (width, height), dark)
-        seen, kept = _seen_values(camera, surface, view, prints)
+        seen, _alive = _seen_values(camera, surface, view, prints)
         lib.picture_draw(*(ctypes.byref(value) for value in (light.values(), seen, floor_there)), address(picture))
-        del kept  # until here
         return picture
     image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
     _draw_surface(image, camera, light, surface, view, prints)

@@ -37,6 +37,7 @@ from hood.solver.compiled.tables import Tables, build_tables, point_uses
 from hood.solver.derivatives.compiled_vertices import drag_structures, grip_structures, wall_structures
 from hood.solver.derivatives.points import PointForces
 from hood.solver.derivatives.self_contact import approached
+from hood.solver.system.linear import TOLERANCES
 from hood.solver.system.plan import SolverPlan
 
 
@@ -200,9 +201,10 @@ class CompiledScene:
         """The matrix of the model with a share of its indefinite part; a move makes its own."""
         self._lib.newton_matrix(self._address, indefinite_share)
 
-    def move(self, residual: float, cg_iterations: int) -> bool:
-        """Take a Newton step from a state whose model has been made; whether it led anywhere."""
-        moved = bool(self._lib.newton_move(self._address, residual, cg_iterations))
+    def move(self, tolerance: float, cg_iterations: int) -> bool:
+        """Take a Newton step from a state whose model has been made, by a linear system solved to a tolerance; whether it led
+        anywhere."""
+        moved = bool(self._lib.newton_move(self._address, tolerance, cg_iterations))
         self._raise()
         return moved
 
@@ -401,7 +403,8 @@ class CompiledSystem:
         return [wanted and self._move(engine, share) for engine, share, wanted in moving]
 
     def _move(self, engine: CompiledScene, residual: float) -> bool:
-        if engine.move(residual, self._cg_iterations):
+        tolerance = min(max(math.sqrt(residual), TOLERANCES[0]), TOLERANCES[1])
+        if engine.move(tolerance, self._cg_iterations):
             return True
         if engine.wide:
             return False
@@ -410,7 +413,7 @@ class CompiledSystem:
         except BuildError:  # kept from a time with a compiler, which is gone: the step ends here and is counted as missed
             return False
         engine.model()
-        return engine.move(residual, self._cg_iterations)
+        return engine.move(tolerance, self._cg_iterations)
 
     def state(self) -> tuple[Tensor, Tensor]:
         """Positions (V, 3) and accelerations (V, 3)."""

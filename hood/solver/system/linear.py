@@ -19,6 +19,8 @@ from hood.solver.system.plan import QuadraticModel, SolverPlan
 from hood.solver.system.sparsity import BlockPattern, row_product
 from hood.tensors.dense import at_once, sum_rows
 
+#: Linear systems are solved to the root of the relative gradient, at least and at most to these.
+TOLERANCES = 1e-3, 0.1
 #: Below this share of the indefinite part the next try does without.
 LEAST_SHARPNESS = 0.2
 #: The first share that is tried.
@@ -85,7 +87,7 @@ class Directions:
             rhs,
             self.plan.scene,
             self.num_scenes,
-            residual.nan_to_num(0.0).sqrt().clamp(1e-3, 0.1),
+            residual.nan_to_num(0.0).sqrt().clamp(*TOLERANCES),
             self.cg_iterations,
         )
         self.used += used
