@@ -27,6 +27,7 @@ MODULES = {
     "hood/mesh/cloth_proximity.py": "pairs of near features and safe moves, two views of one compiled search",
     "hood/mesh/editing/repair.py": "one procedure: find defects, cap holes, cut spikes, repair",
     "hood/mesh/editing/seams.py": "one procedure: rims that face each other, cut to match and sewn",
+    "hood/model/graph/builder.py": "one graph: its static part, the three kinds of edges that change, and what each kind needs",
     "hood/model/features/groups.py": "one class a feature group of the paper",
     "hood/model/readout/output.py": "one class an output; all integrate and correct in the same way",
     "hood/rollouts/checks/guard.py": "what the guard measures, its alarms and its repair decide together",

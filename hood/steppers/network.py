@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -21,10 +21,9 @@ from hood.model.features import compiled
 from hood.model.features.feature_set import FeatureSet
 from hood.model.features.inputs import EdgeRows, Inputs
 from hood.model.features.sets import SETS, SetSettings, build_features, split_name
-from hood.model.graph.builder import Graph, StaticGraph, build_graph, build_static
+from hood.model.graph.builder import Graph, StaticGraph, build_graph, build_static, find_near_cloth
 from hood.model.graph.hierarchy import Hierarchy, concatenate_hierarchies, num_passed_over
 from hood.model.graph.known_hierarchies import template_hierarchy
-from hood.model.graph.near_cloth import find_near_cloth
 from hood.model.graph.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.model.network.model import MeshGraphNet
 from hood.model.parts import MULTILEVEL, OUTPUTS, network_class, output_class
@@ -34,6 +33,7 @@ from hood.native import features as native
 from hood.solver.vertex.block_jacobi import check_local
 from hood.steppers.protocol import FrameRules, Relaxing, Stopwatch, timed
 from hood.steppers.ranges import Conditions
+from hood.tensors.batch import to_device
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,14 @@ class Prepared:
 
     hierarchy: Hierarchy
     static: StaticGraph | None = None  # None inside a batch that is still to be put together
+
+    def to(self, device: torch.device | str) -> Prepared:
+        """The same with the graph on ``device``; the hierarchy stays where it is."""
+        static = self.static
+        if static is None:
+            return self
+        sets = {name: to_device(edges, device) for name, edges in static.edge_sets.items()}
+        return replace(self, static=replace(to_device(static, device), edge_sets=sets))
 
 
 @dataclass(frozen=True)
@@ -361,7 +369,7 @@ def build_simulator(
         frame_dt, pins_ahead, velocity: see :class:`hood.steppers.protocol.FrameRules`.
         late_scale: as ``output_scale``, in the later passes of ``local_steps``.
         layer_radius: reach [m] of edges between layers of cloth, which have networks of their own
-            (:func:`hood.model.graph.near_cloth.find_near_cloth`); None: the model has none.
+            (:func:`hood.model.graph.builder.find_near_cloth`); None: the model has none.
         network: ``multilevel``, or the name of a plugin's.
         output_options: further arguments of the output's class, plain values by name.
         coarse_edge: length [m] that edges of the first coarse level have at least, on average: finer levels are passed over,

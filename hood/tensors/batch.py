@@ -67,16 +67,30 @@ def _merge(spec: Field[Any], values: list[Any], counts: Mapping[str, Sequence[in
     return torch.cat(values)
 
 
+def sent(value: Tensor, device: torch.device | str) -> Tensor:
+    """``value`` on ``device``; nothing waits until it has arrived there."""
+    if value.device.type != "cpu" or torch.device(device).type == "cpu":
+        return value.to(device)
+    return value.pin_memory().to(device, non_blocking=True)
+
+
 def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
-    """The same dataclass with its tensors on ``device`` and its floating tensors in ``dtype`` (float64 origins stay)."""
+    """The same dataclass with its tensors on ``device`` and its floating tensors in ``dtype`` (float64 origins stay); what the
+    host has found out about it stays known."""
     moved: dict[str, Any] = {}
     for spec in fields(item):  # type: ignore[arg-type]
         value = getattr(item, spec.name)
         if isinstance(value, Tensor):
             keep = spec.metadata.get("float64", False) or not value.is_floating_point()
-            value = value.to(device=device, dtype=None if keep else dtype)
+            value = (value if device is None else sent(value, device)).to(dtype=None if keep else dtype)
         moved[spec.name] = value
-    return type(item)(**moved)
+    made = type(item)(**moved)
+    vars(made).update({name: value for name, value in vars(item).items() if name not in moved and not _holds_tensors(value)})
+    return made
+
+
+def _holds_tensors(value: Any) -> bool:
+    return not isinstance(value, (bool, int, float))
 
 
 def forget(kept: MutableMapping[Any, Any], key: Any) -> Callable[[Any], None]:

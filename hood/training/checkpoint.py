@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
+from hood.training.settings import TrainerSettings
 
 #: What a run cannot go on without.
 _KEYS = {"iteration", "seed", "skipped", "skipped_in_row", "rollbacks", "best", "simulator", "average", "optimizer", "slots"}
@@ -87,6 +88,36 @@ def load_last_good(path: Path) -> tuple[dict[str, Any], str | None]:
         except ValueError as second:
             raise ValueError(f"{reason}; and {second}") from error
         return state, f"{reason}; going on from {older.name}, iteration {state['iteration']}"
+
+
+def refuse_other(
+    path: Path, state: Mapping[str, Any], config: Mapping[str, Any], seed: int, settings: TrainerSettings, num_slots: int
+) -> None:
+    """Refuse the checkpoint of a run with another model, another seed, another optimiser or other scenes.
+
+    Args:
+        config: of this run's model; ``num_slots`` running scenes are its own.
+
+    Raises:
+        ValueError: with what to pass.
+    """
+    if state["model"] != config:
+        raise ValueError(f"{path}: trained with model {state['model']}, this run has {config}")
+    if state["seed"] != seed:
+        raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
+    white = state.get("whitening") is not None
+    if white != settings.whitening:
+        raise ValueError(
+            f"{path}: the optimiser is of a training with trainer.whitening={str(white).lower()}; pass "
+            f"trainer.whitening={str(white).lower()} to resume it"
+        )
+    if len(state["slots"]) != num_slots:
+        if settings.max_vertices is None:
+            raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
+        raise ValueError(
+            f"{path}: trained with {len(state['slots'])} running scenes, this run has {num_slots}; pass the "
+            "same trainer.batch_size, trainer.max_vertices and data.garments to resume it"
+        )
 
 
 def generator_states(device: torch.device) -> dict[str, Tensor]:

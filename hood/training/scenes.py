@@ -47,6 +47,7 @@ class Window:
         """The same with the scene's tensors on ``device``."""
         scene = self.scene
         assert isinstance(scene.motion, BodyMotion)
+        _ = scene.cloth.has_pinned  # is known to the host there as well
         motion = scene.motion.with_surfaces(scene.motion.posed, device)
         return replace(self, scene=replace(scene, cloth=to_device(scene.cloth, device), motion=motion))
 

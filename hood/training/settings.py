@@ -12,17 +12,13 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from hood.energies.potential import scale
-from hood.energies.problem import StepProblem
 from hood.model.features.normalizer import Whitening
 from hood.model.kernels.block import KERNELS
 from hood.model.network.kernel_choice import AUTO
 from hood.model.network.mlp import MLP
 from hood.model.network.model import PRECISIONS
-from hood.scene.scene import RELAXING_DT
 from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
-from hood.training.log import relative_loss
 from hood.training.slots import RELAXED_VELOCITIES, TORN_STRAIN
 
 #: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
@@ -35,14 +31,19 @@ _ADAM_RMS = 0.2
 OPTIMIZERS = ("adam", "muon")
 #: What an update is led by, see :class:`TrainerSettings`.
 SIGNALS = ("potential", "scaled", "scaled_by_frame")
-#: Longest step [s] that has its own e0 with ``scaled_by_frame``; the relaxing step has ten times as long.
-_FRAME_DT = RELAXING_DT / 10.0
 
 
-def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -> torch.optim.Optimizer:
-    """``adam``, or ``muon`` for the matrices between latents with Adam for encoders' inputs, outputs, biases and norms."""
+def make_optimizer(
+    name: str, simulator: NetworkStepper, learning_rate: float, on_device: bool = False
+) -> torch.optim.Optimizer:
+    """``adam``, or ``muon`` for the matrices between latents with Adam for encoders' inputs, outputs, biases and norms.
+
+    Args:
+        on_device: the steps of Adam are counted beside the weights, where there is a device beside the CPU.
+    """
     if name == "adam":
-        return torch.optim.Adam(simulator.parameters(), lr=learning_rate)
+        on_device &= simulator.gravity.device.type != "cpu"
+        return torch.optim.Adam(simulator.parameters(), lr=learning_rate, capturable=on_device)
     width = int(simulator.config["latent_dim"])
     inner = [p for p in simulator.parameters() if p.dim() == 2 and p.shape[0] == width and p.shape[1] % width == 0]
     chosen = {id(p) for p in inner}
@@ -50,25 +51,11 @@ def make_optimizer(name: str, simulator: NetworkStepper, learning_rate: float) -
     return MuonAdam([{"params": inner, "matrices": True}, {"params": rest, "matrices": False}], learning_rate)
 
 
-class Signal:
-    """What an update is led by, a name of :data:`SIGNALS`; see :class:`TrainerSettings`."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._longest = _FRAME_DT if name == "scaled_by_frame" else None
-
-    def loss(self, problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, residual: Tensor) -> Tensor:
-        """What is minimised, of every scene (B,), in units of e0: :func:`hood.training.log.relative_loss`."""
-        return relative_loss(problem, energies, acc, self._longest) * self._damping(residual)
-
-    def weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
-        """Factors (B,) on the gradients of the scenes' potentials; ``residual`` (B,) is their rg."""
-        unit = 1.0 if self._name == "potential" else scale(problem, self._longest)
-        return self._damping(residual) / (unit * problem.num_scenes)
-
-    def _damping(self, residual: Tensor) -> Tensor:
-        """How much of a scene (B,) counts: with a scaled signal one that is far from rest less, as far as it is."""
-        return torch.ones_like(residual) if self._name == "potential" else 1.0 / (1.0 + residual / 3.0)
+def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
+    """The state of a checkpoint; where steps are counted stays as it is."""
+    own = [{name: group[name] for name in ("capturable",) if name in group} for group in optimizer.param_groups]
+    groups = [{**given, **kept} for given, kept in zip(state["param_groups"], own, strict=True)]
+    optimizer.load_state_dict({**state, "param_groups": groups})
 
 
 class MuonAdam(torch.optim.Optimizer):
@@ -265,6 +252,12 @@ class TrainerSettings:
         One that breaks off at what is no number is counted with all its steps: schedules are functions of the iteration.
         """
         return self.horizon.rollout(iteration) if self.by_rollout else iteration
+
+    def is_due(self, iteration: int) -> bool:
+        """Whether something follows an iteration for which it must be known what came of the updates so far."""
+        every = (self.log_every, self.checkpoint_every, self.validate_every)
+        due = iteration == self.iterations or iteration in self.keep_at
+        return due or any(number and iteration % number == 0 for number in every)
 
     def compressed(self) -> TrainerSettings:
         """The same with ``time_scale`` 1 and everything that is counted from the start of the schedule multiplied by it:

@@ -18,6 +18,7 @@ from hood.cloth.state import State, StepInput, concatenate_states, concatenate_s
 from hood.scene.scene import RELAXING_DT, recentre
 from hood.solver.step_figures import edge_strain
 from hood.steppers.network import NetworkStepper, Prepared
+from hood.tensors.batch import sent
 from hood.tensors.dense import sum_scenes
 from hood.training.prefetch import MAX_DRAWS, Request, SceneFeed, Start, choose_workers, draw_window, make_start
 from hood.training.scenes import SceneSampler, Window
@@ -94,6 +95,7 @@ class TrainingStep(NamedTuple):
     state: State
     step: StepInput
     kind: tuple[int, bool] | None = None  # template, and whether mirrored: what the topology of a scene alone depends on
+    runs: Tensor | None = None  # () bool: whether the rollout of a scene alone still goes on; None: it does
 
 
 @dataclass
@@ -107,6 +109,15 @@ class _Slot:
     window: Window | None = None
     state: State | None = None
     prepared: Prepared | None = None
+    runs: Tensor | None = None  # () bool on the device, where the host does not know yet
+
+
+class Taken(NamedTuple):
+    """A step that a slot has taken without the host knowing what became of its rollout."""
+
+    slot: _Slot
+    window: Window
+    state: State
 
 
 class Slots:
@@ -199,7 +210,7 @@ class Slots:
         step = scene.step_input(window.start_frame + max(slot.age - 1, 0), slot.state, relaxing=first)
         if first and slot.still:
             step = replace(step, dt=torch.full_like(step.dt, scene.dt))
-        return TrainingStep(scene.cloth, prepared, slot.state, step, (window.template, window.mirrored))
+        return TrainingStep(scene.cloth, prepared, slot.state, step, (window.template, window.mirrored), slot.runs)
 
     def skinned_accelerations(self) -> Tensor:
         """(V, 3) m per frame² of the batch's skinned garments at their current frames: the scale of the paper's output."""
@@ -220,22 +231,43 @@ class Slots:
 
         The turn passes on to the next bucket.
         """
+        for place, taken in enumerate(self._take_over(next_pos, next_vel)):
+            cloth, pos = taken.window.scene.cloth, taken.state.pos
+            ends = bool(is_lost(cloth, pos, self.ending_strain)) if lost is None else lost[place]
+            self.settle([taken], [ends], None if centres is None else centres[place : place + 1])
+
+    def advance_unread(self, next_pos: Tensor, next_vel: Tensor, goes_on: Tensor) -> list[Taken]:
+        """The same, where the device alone knows which rollouts go on, (B,) bool; :meth:`settle` says it later. Until then the
+        origins of the states stay."""
+        taken = self._take_over(next_pos, next_vel)
+        for one, runs in zip(taken, goes_on.unbind(), strict=True):
+            one.slot.runs = runs
+        return taken
+
+    def settle(self, taken: Sequence[Taken], lost: Sequence[bool], centres: Tensor | None) -> None:
+        """End the rollouts that were lost in a step, and move the origins of those that go on from it next to their ``centres``
+        (B, 3) m, on the CPU; None: they are found here."""
+        for place, (slot, window, state) in enumerate(taken):
+            if slot.window is window and slot.state is state:
+                centre = None if centres is None else centres[place : place + 1]
+                slot.state = recentre(state, window.scene.cloth.vertex_scene, centre)
+            if slot.window is window and lost[place]:
+                slot.window = None
+
+    def _take_over(self, next_pos: Tensor, next_vel: Tensor) -> list[Taken]:
         number, slots = self._current()
-        offset = 0
-        for place, slot in enumerate(slots.values()):
+        offset, taken = 0, []
+        for slot in slots.values():
             assert slot.window is not None
             assert slot.state is not None
             rows = slice(offset, offset + slot.window.scene.cloth.num_vertices)
             offset = rows.stop
-            pos, vel, cloth = next_pos[rows].detach(), next_vel[rows].detach(), slot.window.scene.cloth
-            if slot.age == 0:
-                vel = self._relaxed(slot, vel)
-            centre = None if centres is None else centres[place : place + 1]
-            slot.state = recentre(State(pos, vel, slot.state.origin), cloth.vertex_scene, centre)
+            vel = self._relaxed(slot, next_vel[rows].detach()) if slot.age == 0 else next_vel[rows].detach()
+            slot.state = State(next_pos[rows].detach(), vel, slot.state.origin)
             slot.age += 1
-            if is_lost(cloth, pos, self.ending_strain) if lost is None else lost[place]:
-                slot.window = None
+            taken.append(Taken(slot, slot.window, slot.state))
         self._turns[number] += 1
+        return taken
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """By slot: plain numbers and tensors that :meth:`load_state_dict` restores exactly."""
@@ -268,7 +300,7 @@ class Slots:
                 garment = self.buckets[slot.bucket].template(slot.place, draw)
                 window = draw_window(self.sampler, self.seed, index, draw, garment, self.max_horizon + 1)
                 slot.window = window.to(device)
-                slot.prepared = self._prepare(slot.window)
+                slot.prepared, slot.runs = self._prepare(window).to(device), None
                 slot.state = State(entry["pos"].to(device), entry["vel"].to(device), entry["origin"])
             self.feed.expect(self._request(index, slot))
 
@@ -289,9 +321,9 @@ class Slots:
         # The way of the frame before, as a velocity in the time of the first step.
         vel = start.state.vel if self._in_frames(slot) else start.state.vel * (slot.window.scene.dt / RELAXING_DT)
         begin = recentre(State(start.state.pos, vel, start.state.origin), torch.zeros(len(vel), dtype=torch.int64))
-        slot.state = State(begin.pos.to(device), begin.vel.to(device), begin.origin)
+        slot.state = State(sent(begin.pos, device), sent(begin.vel, device), begin.origin)
         slot.draws += start.draws
-        slot.prepared = self._prepare(slot.window)
+        slot.prepared, slot.runs = self._prepare(start.window).to(device), None
         slot.age = 0
         self._batches.pop(slot.bucket, None)
         self.feed.expect(self._request(index, slot))

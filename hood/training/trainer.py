@@ -28,23 +28,17 @@ from hood.training.checkpoint import (
     generator_states,
     load_last_good,
     previous,
+    refuse_other,
     save_checkpoint,
     set_aside,
     set_generator_states,
 )
-from hood.training.log import (
-    Clock,
-    ConstantOutput,
-    LogWindow,
-    MetricsLog,
-    Skipped,
-    made_behind,
-    told,
-)
+from hood.training.log import Clock, ConstantOutput, LogWindow, MetricsLog, Skipped, made_behind, told
+from hood.training.outcome import Signal, StartedUpdate, Update, WeightSteps, read_figures
 from hood.training.scenes import SceneSampler
-from hood.training.settings import Signal, TrainerSettings, make_optimizer, make_whitening
+from hood.training.settings import TrainerSettings, load_optimizer, make_optimizer, make_whitening
 from hood.training.slots import Slots
-from hood.training.updates import Observer, Update, make_captured, plain_update
+from hood.training.updates import Observer, make_captured, plain_update
 from hood.training.watch import ValidationWatch
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
@@ -109,18 +103,17 @@ class Trainer:
                 if isinstance(module, RunningNormalizer):
                     module.shared_sum = distributed.all_reduce_sum
         self._captured = make_captured(simulator, settings, self.slots.ending_strain, self.slots.most_scenes, ranks)
-        self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate)
+        self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate, self._captured is not None)
         self.iteration, self.earlier, self.rollbacks, self.best = 0, earlier, 0, math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: Observer | None = None
         self._constant = ConstantOutput(settings.learning_rate)
         self._skips = Skipped()
-        self._rollbacks_in_row = 0
-        self._failed_at = -1
-        self._saved_at = -1
+        self._rollbacks_in_row, self._failed_at, self._saved_at = 0, -1, -1
         self._metrics: MetricsLog | None = None
         self._window = LogWindow()
-        self._average = {name: value.detach().clone() for name, value in simulator.named_parameters()}
+        self._steps = WeightSteps(simulator, self.optimizer, self.whitening, settings.ema_decay)
+        self._begun: list[StartedUpdate] = []  # updates that :meth:`look` has not told of
 
     @property
     def checkpoint_path(self) -> Path:
@@ -154,9 +147,11 @@ class Trainer:
             if self.iteration == 0 and self._saved_at != 0:
                 self.save()  # something to go back to, and a full disk shows at once
             clock = Clock(self.iteration)
-            while self.iteration < settings.iterations and not distributed.any_rank(should_stop()):
-                report = self.update()
-                last = self.iteration == settings.iterations
+            while self.iteration < settings.iterations and (self._begun or not distributed.any_rank(should_stop())):
+                self.begin()
+                if self._reads_late and not settings.is_due(self.iteration):
+                    continue
+                reports, last = self.look(), self.iteration == settings.iterations
                 # In the middle of a streak of skipped updates the weights are not known to be good.
                 keeping = self.iteration in settings.keep_at
                 saving = last or ((keeping or self.iteration % settings.checkpoint_every == 0) and not self._skips.in_row)
@@ -164,14 +159,15 @@ class Trainer:
                     self._roll_back()
                     clock = Clock(self.iteration)
                     continue
-                self._window.add(report)
+                for report in reports:
+                    self._window.add(report)
                 if last or self.iteration % settings.log_every == 0:
                     means = self._window.close()
                     self._log({**means, "iterations_per_second": clock.rate(self.iteration)})
                     if distributed.rank() == 0:
                         self._constant.look(self.iteration, means["output_spread"])
                 if progress is not None:
-                    progress(self.iteration, report)
+                    progress(self.iteration, reports[-1])
                 if self.watch is not None and settings.validate_every and self.iteration % settings.validate_every == 0:
                     with clock.paused():
                         self._validate()
@@ -193,29 +189,62 @@ class Trainer:
 
     def update(self) -> dict[str, float]:
         """One step of every slot and one optimiser update; returns what was measured."""
+        self.begin()
+        return self.look()[-1]
+
+    def begin(self) -> None:
+        """One update, of which :meth:`look` tells what came of it; the host waits for nothing where the device decides that."""
         settings, simulator = self.settings, self.simulator
         simulator.train()
         count = settings.count(self.iteration)
         potential = settings.collision.apply(self.potential, count)
         simulator.use_potential(for_networks(potential))
         collecting = self.iteration < settings.statistics_iterations and simulator.uses_statistics
-        while True:
-            self.optimizer.zero_grad(set_to_none=True)
-            with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
-                update = self._take(potential, settings.horizon.after_relaxing(count), collecting)
-            norm = None if collecting else self._answer(update)
-            figures = update.read(norm)
-            if update.holds(figures):
-                break
-        means = figures.measured
-        energies = {name: means[name] for name in update.energies}
-        report = {**energies, "total": sum(energies.values()), **means, "horizon": float(settings.horizon(count))}
-        if norm is not None:
-            report |= self._optimise(energies, norm, figures.norm)
+        self.optimizer.zero_grad(set_to_none=True)
+        with torch.set_grad_enabled(not collecting), self.whitening.around(simulator.network, collecting):
+            update = self._take(potential, settings.horizon.after_relaxing(count), collecting)
+        begun = StartedUpdate(update, None if collecting else self._answer(update), {"horizon": float(settings.horizon(count))})
+        if update.acceptance is None:
+            read_figures([begun])
+        if begun.norm is not None:
+            self._optimise(begun, begun.norm)
         with timed(self.stopwatch, "scenes"):
-            self.slots.advance(update.next_pos, update.next_vel, figures.lost, figures.centres)
+            if begun.figures is None:
+                assert update.acceptance is not None
+                begun.taken = self.slots.advance_unread(update.next_pos, update.next_vel, update.acceptance.goes_on)
+            else:
+                self.slots.advance(update.next_pos, update.next_vel, begun.figures.lost, begun.figures.centres)
         self.iteration += 1
-        return report
+        self._begun.append(begun)
+
+    def look(self) -> list[dict[str, float]]:
+        """What was measured of every update since the last look; waits for the device, once at most."""
+        self._settle()
+        first, begun, self._begun = self.iteration - len(self._begun), self._begun, []
+        return [self._report(number, one) for number, one in enumerate(begun, first + 1)]
+
+    def _settle(self) -> None:
+        """Read what the device has decided."""
+        unread = [begun for begun in self._begun if begun.figures is None]
+        read_figures(unread)
+        for one in unread:
+            assert one.figures is not None
+            if self._captured is not None:
+                self._captured.make_room(one.update, one.figures)
+            self.slots.settle(one.taken, one.figures.lost, one.figures.centres)
+        self._steps.forget(sum(one.norm is not None and not one.made for one in unread))
+
+    def _report(self, iteration: int, begun: StartedUpdate) -> dict[str, float]:
+        """Of one update, which is counted."""
+        report, figures = begun.report(), begun.figures
+        assert figures is not None
+        if begun.norm is None:
+            return report
+        if begun.made:
+            self._skips.make()
+        elif any(figures.counted):
+            self._skips.skip(iteration, {name: report[name] for name in begun.update.energies}, figures.norm)
+        return report | {"skipped": float(self.skipped)}
 
     def _take(self, potential: Potential, horizon: int, collecting: bool) -> Update:
         """The step of all scenes."""
@@ -229,6 +258,7 @@ class Trainer:
             except (ValueError, RuntimeError) as error:
                 if self.settings.step != "auto":
                     raise
+                self._settle()
                 self._captured = None
                 say(f"hood: trainer.step=plain: no CUDA graph of an update could be made ({error})", error=True)
         with timed(clock, "scenes"):
@@ -241,7 +271,7 @@ class Trainer:
     def averaged(self) -> NetworkStepper:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""
         clone = self.simulator.clone()
-        clone.load_state_dict(self.simulator.state_dict() | (self._average if self.settings.ema_decay > 0 else {}))
+        clone.load_state_dict(self.simulator.state_dict() | (self._steps.average if self.settings.ema_decay > 0 else {}))
         return clone.eval()
 
     def save(self) -> None:
@@ -262,7 +292,7 @@ class Trainer:
             "rollbacks": [self.rollbacks, self._rollbacks_in_row, self._failed_at],
             "best": self.best,
             "simulator": self.simulator.state_dict(),
-            "average": self._average,
+            "average": self._steps.average,
             "optimizer": self.optimizer.state_dict(),
             "whitening": self.whitening.state_dict() if self.settings.whitening else None,
             "slots": slots,
@@ -285,23 +315,7 @@ class Trainer:
         if note and distributed.rank() == 0:
             say(f"hood: {note}", error=True)
             set_aside(path)
-        if state["model"] != self.simulator.config:
-            raise ValueError(f"{path}: trained with model {state['model']}, this run has {self.simulator.config}")
-        if state["seed"] != self.seed:
-            raise ValueError(f"{path}: trained with seed {state['seed']}; pass seed={state['seed']} to resume it")
-        white = state.get("whitening") is not None
-        if white != self.settings.whitening:
-            raise ValueError(
-                f"{path}: the optimiser is of a training with trainer.whitening={str(white).lower()}; pass "
-                f"trainer.whitening={str(white).lower()} to resume it"
-            )
-        if len(state["slots"]) != self.slots.num_slots:
-            if self.settings.max_vertices is None:
-                raise ValueError(f"{path}: trained with trainer.batch_size={len(state['slots'])}; pass the same to resume it")
-            raise ValueError(
-                f"{path}: trained with {len(state['slots'])} running scenes, this run has {self.slots.num_slots}; pass the "
-                "same trainer.batch_size, trainer.max_vertices and data.garments to resume it"
-            )
+        refuse_other(path, state, self.simulator.config, self.seed, self.settings, self.slots.num_slots)
         self._restore(state)
         self._saved_at = self.iteration if note is None else -1
         self.slots.load_state_dict(state["slots"])
@@ -312,6 +326,10 @@ class Trainer:
         if len(state["rng"]) == distributed.world_size():
             set_generator_states(state["rng"][distributed.rank()], self._device)
             self._window.load_state_dict(state["window"][distributed.rank()])
+
+    @property
+    def _reads_late(self) -> bool:
+        return self._captured is not None and self._captured.reads_late
 
     @property
     def _iterations_in_all(self) -> str:
@@ -340,9 +358,9 @@ class Trainer:
     def _restore(self, state: Mapping[str, Any]) -> None:
         """What is learned, as it was at the checkpoint."""
         self.simulator.load_state_dict(state["simulator"])
-        for name, mean in self._average.items():
+        for name, mean in self._steps.average.items():
             mean.copy_(state["average"][name])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_optimizer(self.optimizer, state["optimizer"])
         self.whitening.load_state_dict(state.get("whitening"))
         self.iteration = int(state["iteration"])
         self._skips.made = made_behind(state)
@@ -353,7 +371,7 @@ class Trainer:
             return True
         if not look and not self._skips.in_row:
             return False
-        values = (*self.simulator.state_dict().values(), *self._average.values())
+        values = (*self.simulator.state_dict().values(), *self._steps.average.values())
         return not all(bool(torch.isfinite(value).all()) for value in values if value.is_floating_point())
 
     def _roll_back(self) -> None:
@@ -413,31 +431,18 @@ class Trainer:
             self.whitening.pull()
             return get_total_norm([value.grad for value in self.simulator.parameters() if value.grad is not None])
 
-    def _optimise(self, energies: Mapping[str, float], total: Tensor, norm: float) -> dict[str, float]:
-        """One step of the optimiser, if energies and the gradients' norm are finite; ``total`` () is it on the device."""
-        settings, finite = self.settings, math.isfinite(sum(energies.values()))
-        factor = settings.schedule(self.iteration, settings.iterations)
+    def _optimise(self, begun: StartedUpdate, norm: Tensor) -> None:
+        """One step of the optimiser, if energies and the gradients' ``norm`` () are finite."""
+        settings, acceptance = self.settings, begun.update.acceptance
+        rate = settings.learning_rate * settings.schedule(self.iteration, settings.iterations)
+        begun.settings["learning_rate"] = rate
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.learning_rate * factor
+            group["lr"] = rate
         with timed(self.stopwatch, "optimiser"):
-            clip_grads_with_norm_(self.simulator.parameters(), settings.clip_norm, total)
-            if distributed.any_rank(not (finite and math.isfinite(norm))):
-                self._skips.skip(self.iteration + 1, energies, norm)
+            clip_grads_with_norm_(self.simulator.parameters(), settings.clip_norm, norm)
+            if acceptance is not None:
+                self._steps.take(self.iteration, acceptance.usable & (norm < math.inf))
+            elif distributed.any_rank(not begun.made):
+                begun.made = False
             else:
-                self.whitening.push(self.optimizer)
-                self._update_average()
-                self._skips.make()
-        return {
-            "parameter_gradient_norm": norm,
-            "learning_rate": settings.learning_rate * factor,
-            "skipped": float(self.skipped),
-        }
-
-    def _update_average(self) -> None:
-        decay = self.settings.ema_decay
-        if decay <= 0:
-            return
-        # Early averages forget faster, so that the first checkpoints are not the untrained weights.
-        decay = min(decay, (1 + self.iteration) / (10 + self.iteration))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self._average.values()), list(self.simulator.parameters()), 1 - decay)
+                self._steps.take(self.iteration)

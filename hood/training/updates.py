@@ -3,17 +3,15 @@ function of fixed shapes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from hood.cloth.cloth import Cloth
-from hood.cloth.state import centres_of
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
@@ -29,75 +27,12 @@ from hood.steppers.static_shapes.problem import altered, problem_from, settled_p
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
 from hood.tensors.precision import products
 from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
-from hood.training.log import output_spread
-from hood.training.settings import Signal, TrainerSettings
-from hood.training.slots import TrainingStep, is_lost
+from hood.training.outcome import Acceptance, Figures, Signal, Update, figures_of, outcome_of
+from hood.training.settings import TrainerSettings
+from hood.training.slots import TrainingStep
 
 #: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
 Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
-
-
-class Figures(NamedTuple):
-    """What the host is told of an update."""
-
-    measured: dict[str, float]  # means of the energies, then what :data:`MEASURED` says
-    lost: list[bool]  # by scene: rollouts that end here
-    centres: Tensor  # (B, 3) m: means of the vertices of a scene where it leads
-    norm: float  # of the gradients; NaN: none were given
-    num_found: list[tuple[int, int, int]]  # by scene, see :class:`hood.steppers.static_shapes.simulator.StepResult`
-
-
-@dataclass(frozen=True)
-class Update:
-    """Where an update leads its scenes, and what was measured; the gradients are with the parameters."""
-
-    next_pos: Tensor  # (V, 3) m
-    next_vel: Tensor  # (V, 3) m/s
-    measured: Tensor  # (M,) means of the energies in the order of ``energies``, then what :data:`MEASURED` says
-    energies: tuple[str, ...]
-    told: Tensor  # (B, 4) :func:`outcome_of`, or (B, 7) with what was found
-    backward: Callable[[], None] | None = None  # computes the gradients, where that is not done
-    holds: Callable[[Figures], bool] = lambda figures: True  # False: there was no room; the update is to be taken again
-
-    def read(self, norm: Tensor | None = None) -> Figures:
-        """The figures, with the ``norm`` () of the gradients; waits for the device, once."""
-        given = [self.told.flatten(), self.measured, *([] if norm is None else [norm.reshape(1)])]
-        values, count = torch.cat([value.to(self.measured) for value in given]).cpu(), self.told.numel()
-        told, measured = values[:count].reshape(self.told.shape), values[count:].tolist()
-        found = [cast(tuple[int, int, int], tuple(map(int, row))) for row in told[:, 4:].tolist()]
-        return Figures(
-            dict(zip((*self.energies, *MEASURED), measured, strict=False)),
-            (told[:, 0] > 0).tolist(),
-            told[:, 1:4],
-            math.nan if norm is None else measured[-1],
-            found,
-        )
-
-
-#: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
-#: output; of scenes that are updated one after the other the means of these.
-MEASURED = ("loss", "relative_gradient", "output_spread")
-
-
-def figures_of(
-    problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, output: Tensor, residual: Tensor, signal: Signal
-) -> Tensor:
-    """:attr:`Update.measured` (M,).
-
-    Args:
-        energies: (B,) [J] by name.
-        acc: (V, 3) m/s² of the step; ``output`` those that the network gives.
-        residual: (B,), the relative gradient.
-    """
-    means = [value.mean() for value in energies.values()]
-    loss = signal.loss(problem, energies, acc, residual).mean()
-    return torch.stack([*means, loss, residual.median(), output_spread(output, problem.cloth.free).to(loss)])
-
-
-def outcome_of(cloth: Cloth, next_pos: Tensor, torn_strain: float) -> Tensor:
-    """(B, 4): whether a rollout ends here (:func:`hood.training.slots.is_lost`), and the centre of its cloth [m]."""
-    lost = is_lost(cloth, next_pos, torn_strain)
-    return torch.cat([lost.to(next_pos).unsqueeze(1), centres_of(next_pos, cloth.vertex_scene, len(lost))], dim=1)
 
 
 def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
@@ -168,6 +103,8 @@ def plain_update(
 #: Scenes of an update that graphs take one after the other, unless asked for. To start the 6,000 kernels of a plain update
 #: takes about as long as eight graphs of 1,000 vertices are computed; that follows from counts and was not measured.
 MOST_SCENES = 8
+#: Columns of :attr:`Update.told`.
+_TOLD = 9
 
 
 class CapturedUpdates:
@@ -175,7 +112,9 @@ class CapturedUpdates:
     are one function of tensors, which waits for nothing on the host.
 
     One is made for every garment, and again for its mirror image: what is drawn anew (size, fabric, body) is among its inputs.
-    The scenes of a batch take it one after the other. What comes out is what :func:`plain_update` gives, up to rounding.
+    The scenes of a batch take it one after the other. What comes out is what :func:`plain_update` gives, up to rounding; but
+    it is for the device to say what becomes of it. A rollout that is lost, or that finds more than there are places for, stays
+    where it was and gives no gradient until the host has read of it and begins the next one.
 
     Args:
         simulator: one that :func:`refusal` has nothing against.
@@ -186,12 +125,16 @@ class CapturedUpdates:
     def __init__(self, simulator: NetworkStepper, signal: Signal, torn_strain: float, mode: str) -> None:
         self.simulator, self.signal, self.torn_strain, self.mode = simulator, signal, torn_strain, mode
         self._plans: dict[Any, _Plan] = {}
-        self._capacities: dict[Any, Capacity] = {}
-        self._statistics = list(_statistics(simulator).values())
-        self._before = [value.clone() for value in self._statistics]
+        self._found: dict[Any, tuple[int, int, int]] = {}  # most of an update, where there was no room for it
+        self.running = torch.ones((), dtype=torch.bool, device=simulator.gravity.device)
+
+    @property
+    def reads_late(self) -> bool:
+        """Whether many updates are begun before the host reads what came of them."""
+        return self.mode == "captured"
 
     def __call__(self, parts: Sequence[TrainingStep], potential: Potential) -> Update:
-        """One update of the scenes, one after the other; the gradients of their mean are with the parameters.
+        """One update of the scenes, one after the other; the gradients of their mean are with the parameters, finite always.
 
         Args:
             potential: the same in every update, but for its weight of contact.
@@ -199,38 +142,38 @@ class CapturedUpdates:
         Raises:
             ValueError: a scene or the potential has no form of fixed shapes; the message says what to use.
         """
-        if self._statistics:
-            torch._foreach_copy_(self._before, self._statistics)
-        asked = [self._made_ready(part, potential) for part in parts]
-        outcomes = [plan.take(problem, potential, len(parts) == 1) for plan, problem in asked]
-        for parameter, *given in zip(self.simulator.parameters(), *(outcome.gradients for outcome in outcomes), strict=True):
-            parameter.grad = given[0] if len(given) == 1 else torch.stack(given).mean(dim=0)
-        count = len(outcomes[0].energies) + len(MEASURED)
-        told = torch.stack([outcome.numbers[count:] for outcome in outcomes])
-
-        def holds(figures: Figures) -> bool:
-            """Room is made where there was none, and the statistics are those of before."""
-            found: dict[_Plan, tuple[int, int, int]] = {}
-            for (plan, _), counts in zip(asked, figures.num_found, strict=True):
-                found[plan] = cast(tuple[int, int, int], tuple(map(max, counts, found.get(plan, counts))))
-            short = [plan for plan, counts in found.items() if not plan.layout.capacity.holds(counts)]
-            for plan in short:
-                self._capacities[plan.key] = more_capacity(found[plan], plan.like)
-                self._plans.pop(plan.key)
-            if short:
-                asked.clear()  # memory of plans is free before there are others
-            if short and self._statistics:
-                torch._foreach_copy_(self._statistics, self._before)
-            return not short
-
-        return Update(
-            torch.cat([outcome.next_pos for outcome in outcomes]),
-            torch.cat([outcome.next_vel for outcome in outcomes]),
-            torch.stack([outcome.numbers[:count] for outcome in outcomes]).mean(dim=0),
-            outcomes[0].energies,
-            told,
-            holds=holds,
+        asked = [(*self._made_ready(part, potential), self.running if part.runs is None else part.runs) for part in parts]
+        outcomes = [plan.take(problem, potential, runs, len(parts) == 1) for plan, problem, runs in asked]
+        numbers, verdicts, gradient = (
+            _stacked([getattr(one, name) for one in outcomes]) for name in ("numbers", "acceptance", "gradient")
         )
+        (goes_on, used, counts), measured = verdicts.unbind(dim=1), numbers[:, :-_TOLD]
+        if len(outcomes) > 1:
+            gradient = gradient.sum(dim=0) / used.sum().clamp_min(1)
+            measured = torch.where(counts.unsqueeze(1), measured, 0.0).sum(dim=0) / counts.sum()
+            usable = (used == counts).all() & used.any()
+        else:
+            gradient, measured, usable = gradient[0], measured[0], used[0]
+        parameters = list(self.simulator.parameters())
+        for parameter, values in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
+            parameter.grad = values.view_as(parameter)
+        return Update(
+            _joined([one.next_pos for one in outcomes]),
+            _joined([one.next_vel for one in outcomes]),
+            measured,
+            outcomes[0].energies,
+            numbers[:, -_TOLD:],
+            acceptance=Acceptance(goes_on, usable),
+            plans=[plan for plan, _, _ in asked],
+        )
+
+    def make_room(self, update: Update, figures: Figures) -> None:
+        """More places where an update found more than there were."""
+        for plan, counts in zip(update.plans, figures.num_found, strict=True):
+            if not plan.layout.capacity.holds(counts):
+                most = map(max, counts, self._found.get(plan.key, counts))
+                self._found[plan.key] = cast(tuple[int, int, int], tuple(most))
+                self._plans = {key: known for key, known in self._plans.items() if known is not plan}
 
     def _made_ready(self, part: TrainingStep, potential: Potential) -> tuple[_Plan, StepProblem]:
         problem = StepProblem(part.cloth, part.state, part.step, gravity=self.simulator.gravity)
@@ -238,7 +181,8 @@ class CapturedUpdates:
             raise ValueError("scenes with fasteners have no update of fixed shapes: use trainer.step=plain")
         key = (part.kind, _shape(problem))
         if key not in self._plans:
-            capacity = self._capacities.get(key) or first_capacity(self.simulator, problem)
+            found = self._found.get(key)
+            capacity = first_capacity(self.simulator, problem) if found is None else more_capacity(found, problem)
             self._plans[key] = _Plan(self, key, problem, part.prepared, potential, capacity)
         return self._plans[key], problem
 
@@ -252,9 +196,10 @@ class CapturedUpdates:
 class _Outcome:
     next_pos: Tensor
     next_vel: Tensor
-    numbers: Tensor  # (M + 7,): Update.measured, then a row of Update.told
+    numbers: Tensor  # (M + 9,): Update.measured, then a row of Update.told
+    acceptance: Tensor  # (3,) bool: whether the rollout goes on, whether its gradient is used, whether the scene counts
+    gradient: Tensor  # (P,) of all parameters, one after the other; zero where it is not used
     energies: tuple[str, ...]
-    gradients: tuple[Tensor, ...]
 
 
 class _Plan:
@@ -270,13 +215,13 @@ class _Plan:
         capacity: Capacity,
     ) -> None:
         assert prepared.static is not None
-        simulator, self.key, self.like = owner.simulator, key, problem
+        simulator, self.key = owner.simulator, key
         self.layout: StaticLayout = lay_out(prepared.static, capacity, None)
         self._simulator = simulator
-        self._inputs = InputMemory(self._read(problem, potential))
+        self._inputs = InputMemory(self._read(problem, potential, owner.running))
         self._statistics = list(_statistics(simulator).values())
         function = _Function(owner, self.layout, problem, settled_potential(potential, problem))
-        self._energies, self._num_parameters = function.energies, len(function.parameters)
+        self._energies = function.energies
         memory = [*self._inputs.tensors, *simulator.parameters(), *self._statistics]
         self._memory, self.pool = memory, owner.pool
         run: Run = function
@@ -286,32 +231,29 @@ class _Plan:
             self.pool = run.pool
         self._run = run
 
-    def take(self, problem: StepProblem, potential: Potential, alone: bool) -> _Outcome:
-        """The update; ``alone``: its gradients are used before the next one is computed."""
-        self._inputs.load(self._read(problem, potential))
-        with products(self._simulator.network.precision):
-            next_pos, next_vel, numbers, *rest = self._run(*self._memory)
-        gradients = rest[: self._num_parameters]
-        if self._statistics:
-            torch._foreach_copy_(self._statistics, rest[self._num_parameters :])
-        return _Outcome(
-            next_pos.clone(),  # the next update writes to the same memory
-            next_vel.clone(),
-            numbers if alone else numbers.clone(),
-            self._energies,
-            tuple(gradients) if alone else tuple(gradient.clone() for gradient in gradients),
-        )
+    def take(self, problem: StepProblem, potential: Potential, runs: Tensor, alone: bool) -> _Outcome:
+        """The update.
 
-    def _read(self, problem: StepProblem, potential: Potential) -> list[Tensor]:
+        Args:
+            runs: () bool: the rollout is not one that waits for the next.
+            alone: the gradient is used before the next update is computed.
+        """
+        self._inputs.load(self._read(problem, potential, runs))
+        with products(self._simulator.network.precision):
+            found = self._run(*self._memory)
+        if self._statistics:
+            torch._foreach_copy_(self._statistics, found[5:])
+        # The next update writes to the same memory.
+        next_pos, next_vel, numbers, acceptance = (value.clone() for value in found[:4])
+        return _Outcome(next_pos, next_vel, numbers, acceptance, found[4] if alone else found[4].clone(), self._energies)
+
+    def _read(self, problem: StepProblem, potential: Potential, runs: Tensor) -> list[Tensor]:
         weight = problem.state.pos.new_full((), contact_weight(potential))
-        return [weight, *_values(problem.cloth).values(), *step_inputs(problem, surface=True)]
+        return [runs, weight, *_values(problem.cloth).values(), *step_inputs(problem, surface=True)]
 
 
 class _Function:
-    """``next_pos, next_vel, numbers, *gradients, *statistics = function(*inputs)``.
-
-    ``numbers`` are :attr:`Update.measured`, then a row of :attr:`Update.told`.
-    """
+    """``next_pos, next_vel, numbers, acceptance, gradient, *statistics = function(*inputs)``, see :class:`_Outcome`."""
 
     def __init__(self, owner: CapturedUpdates, layout: StaticLayout, like: StepProblem, potential: Potential) -> None:
         simulator = owner.simulator
@@ -325,19 +267,36 @@ class _Function:
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         given, count = list(inputs), len(self.parameters)
-        statistics = [value.clone() for value in given[len(given) - len(self._statistics) :]]
+        before = given[len(given) - len(self._statistics) :]
+        statistics = [value.clone() for value in before]
         del given[len(given) - len(self._statistics) :]
         parameters = [value.detach().requires_grad_() for value in given[len(given) - count :]]
         del given[len(given) - count :]
         state = {f"simulator.{name}": value for name, value in zip(self.parameters, parameters, strict=True)}
         state |= {f"simulator.{name}": value for name, value in zip(self._statistics, statistics, strict=True)}
         with native.in_torch(), torch.enable_grad():
-            surrogate, found = functional_call(self._module, state, tuple(given))
+            surrogate, found = functional_call(self._module, state, tuple(given[1:]))
             gradients = torch.autograd.grad(surrogate, parameters, allow_unused=True, materialize_grads=True)
-        return (*found, *gradients, *statistics)
+        next_pos, next_vel, measured, outcome, num_found = found
+        gradient, energies = torch.cat([value.flatten() for value in gradients]), measured[: len(self.energies)]
+        counts = given[0] & self._has_room(num_found)
+        used = counts & gradient.isfinite().all() & energies.sum().isfinite()
+        goes_on = counts & (outcome[0] == 0)
+        began = given[2 + len(self._values) :][:2]  # positions and velocities before the step
+        pos, vel = (torch.where(goes_on, new, old) for new, old in zip((next_pos, next_vel), began, strict=True))
+        acceptance = torch.stack([goes_on, used, counts])
+        numbers = torch.cat([value.to(measured) for value in (measured, outcome, acceptance[1:].flip(0), num_found)])
+        kept = [torch.where(used, new, old) for new, old in zip(statistics, before, strict=True)]
+        return (pos, vel, numbers, acceptance, torch.where(used, gradient, 0.0), *kept)
+
+    def _has_room(self, num_found: Tensor) -> Tensor:
+        """() bool: :meth:`hood.model.graph.static_shapes.Capacity.holds` what was found (3,)."""
+        edges, vertices, faces = num_found.unbind()
+        capacity = self._layout.capacity
+        return (edges < capacity.edges) & (vertices < capacity.vertices) & (faces <= capacity.faces)
 
     def look(self, simulator: NetworkStepper, weight: Tensor, *values: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The number whose gradient trains, and what is not a gradient."""
+        """The number whose gradient trains; positions, velocities, what was measured, how it ends, and what was found."""
         names, owner = self._values, self._owner
         cloth = _with_values(self._like.cloth, dict(zip(names, values[: len(names)], strict=True)))
         problem, incidence = problem_from(altered(self._like, cloth=cloth), values[len(names) :])
@@ -355,8 +314,7 @@ class _Function:
         surrogate = surrogate_of(problem, prediction, gradient, residual, owner.signal)
         measured = figures_of(problem, energies, acc, acc, residual, owner.signal)
         (outcome,) = outcome_of(cloth, next_pos, owner.torn_strain)
-        numbers = torch.cat([measured, outcome.to(measured), num_found.to(measured)])
-        return surrogate, (next_pos, simulator.next_velocity(problem, prediction).detach(), numbers)
+        return surrogate, (next_pos, simulator.next_velocity(problem, prediction).detach(), measured, outcome, num_found)
 
 
 class _Signal(nn.Module):
@@ -368,6 +326,14 @@ class _Signal(nn.Module):
 
     def forward(self, *values: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         return self._function.look(self.simulator, *values)
+
+
+def _stacked(values: list[Tensor]) -> Tensor:
+    return torch.stack(values) if len(values) > 1 else values[0].unsqueeze(0)
+
+
+def _joined(values: list[Tensor]) -> Tensor:
+    return torch.cat(values) if len(values) > 1 else values[0]
 
 
 def make_captured(

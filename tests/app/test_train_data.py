@@ -145,7 +145,7 @@ def test_training_from_given_weights(tmp_path: Path) -> None:
     for name, value in second.simulator.state_dict().items():
         assert value.equal(expected[name]), name
     assert any(not value.equal(expected[name]) for name, value in fresh.items())
-    assert all(value.equal(expected[name]) for name, value in second._average.items())
+    assert all(value.equal(expected[name]) for name, value in second._steps.average.items())
     second.folder.mkdir()
     second.save()  # says how long the weights have been trained in all
     assert read_header(tmp_path / "second" / "model.safetensors")["iteration"] == "3"

@@ -153,29 +153,36 @@ class Launches(TorchDispatchMode):
 
 
 def launches(folder: Path) -> dict[str, object]:
-    """Operations and waits in the cheapest update of the paper's model, one in which no scene begins, by how it is taken."""
+    """Operations and waits in the cheapest update of the paper's model, one in which no scene begins, and waits of a read of
+    several updates, by how they are taken."""
     from hood.training.trainer import Trainer
 
-    update, found = Trainer.update, {}
+    methods, found = {name: getattr(Trainer, name) for name in ("begin", "look")}, {}
     words = ("experiment=paper_fast", "model.latent_dim=8", *TRAINING[2:], "trainer.iterations=9", "trainer.horizon.every=2")
     words += ("trainer.collision.begin_iteration=2", "trainer.collision.end_iteration=9", "trainer.schedule.every=9")
     for step in ("plain", "captured"):
-        counted: list[tuple[int, int]] = []
+        counted: dict[str, list[tuple[int, int]]] = {name: [] for name in methods}
 
-        def counting(trainer: Any, counted: list[tuple[int, int]] = counted) -> dict[str, float]:
-            torch.standin.forget()
-            with Launches() as launched:
-                report = update(trainer)
-            calls = torch.standin.counts()
-            counted.append((launched.count, sum(number for name, number in calls.items() if name.startswith("sync"))))
-            return report
+        def counting(name: str, counted: dict[str, list[tuple[int, int]]] = counted) -> Any:
+            def counted_method(trainer: Any) -> Any:
+                torch.standin.forget()
+                with Launches() as launched:
+                    came = methods[name](trainer)
+                calls = torch.standin.counts()
+                counted[name].append((launched.count, sum(number for key, number in calls.items() if key.startswith("sync"))))
+                return came
 
-        Trainer.update = counting  # type: ignore[method-assign]
+            return counted_method
+
+        for name in methods:
+            setattr(Trainer, name, counting(name))
         try:
             code = command("train", *words, f"trainer.step={step}", "standin", folder / step)
         finally:
-            Trainer.update = update  # type: ignore[method-assign]
-        found[step] = {"code": code, "launches and waits": min(counted[1:]), "recorded": list(standin.recorded)}
+            for name in methods:
+                setattr(Trainer, name, methods[name])
+        found[step] = {"code": code, "launches and waits": min(counted["begin"][1:]), "recorded": list(standin.recorded)}
+        found[step] |= {"all": counted["begin"], "reads": [waits for _, waits in counted["look"]]}
     return found
 
 

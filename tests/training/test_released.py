@@ -120,7 +120,7 @@ def roll(slots: Slots, horizons: Sequence[int]) -> list[tuple[float, bool, Tenso
     """What every step was given: dt, whether the body stood still, positions and velocities. Cloth falls by 1 mm a step."""
     seen = []
     for horizon in horizons:
-        _, _, state, step, _ = slots.batch(horizon)
+        _, _, state, step, *_ = slots.batch(horizon)
         body = step.obstacle
         assert body is not None
         seen.append((float(step.dt), torch.equal(body.pos, body.next_pos), state.pos, state.vel))
@@ -207,7 +207,7 @@ def test_networks_and_energies_are_told_of_the_same_way(frames: bool, body: Body
     sampler = sampler_of(body, skirt, walk, noise=3e-3)
     model = tiny(**FRAMES) if frames else tiny()
     slots = Slots(sampler, model, 1, 0, 4, whole=True)
-    cloth, _, state, step, _ = slots.batch(2)
+    cloth, _, state, step, *_ = slots.batch(2)
     way = make_start(sampler, slots._request(0, replace(slots._slots[0], draws=0))).state.vel * DT
     told = state.vel * (DT if frames else RELAXING_DT)
     torch.testing.assert_close(told, way)

@@ -68,7 +68,7 @@ def record(slots: Slots, num_updates: int) -> list[tuple[Tensor, ...]]:
     """What the network gets to see in the next updates; cloth moves with the body."""
     seen = []
     for _ in range(num_updates):
-        cloth, _, state, step, _ = slots.batch(HORIZON)
+        cloth, _, state, step, *_ = slots.batch(HORIZON)
         obstacle = step.obstacle
         assert obstacle is not None
         seen.append((cloth.rest_pos, cloth.density, cloth.faces, state.pos, obstacle.pos, obstacle.next_pos, obstacle.faces))

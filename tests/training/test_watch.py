@@ -95,13 +95,13 @@ def test_validation_does_not_count_as_training(tmp_path: Path, sampler: SceneSam
         return {"score": 1.0}, None
 
     trainer = make(tmp_path, sampler, watch)
-    update, told = trainer.update, []
+    begin, told = trainer.begin, []
 
-    def counted() -> dict[str, float]:
+    def counted() -> None:
         now[0] += 1.0
-        return update()
+        begin()
 
-    trainer.update = counted  # type: ignore[method-assign]
+    trainer.begin = counted  # type: ignore[method-assign]
     assert trainer.run(lambda iteration, report: told.append((iteration, report is None)))
     rates = [line["iterations_per_second"] for line in lines(tmp_path) if "iterations_per_second" in line]
     assert rates == pytest.approx([1.0] * 6)

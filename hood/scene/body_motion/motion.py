@@ -18,7 +18,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import blend_in
 from hood.cloth.state import Obstacle
-from hood.tensors.batch import forget
+from hood.tensors.batch import forget, sent
 
 #: Frames posed at once: enough to amortise the call, few enough for short training windows.
 _CHUNK = 16
@@ -169,7 +169,7 @@ class BodyMotion:
 
     def with_surfaces(self, chunks: Mapping[int, Tensor], device: torch.device | str) -> BodyMotion:
         """The same motion on ``device`` with surfaces posed before; none is posed again as long as all are given."""
-        kept = {key: chunk.to(device) for key, chunk in chunks.items()}
+        kept = {key: sent(chunk, device) for key, chunk in chunks.items()}
         return replace(self, device=torch.device(device), _cache=kept, _placed={})
 
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
@@ -226,7 +226,7 @@ class BodyMotion:
         rest = torch.as_tensor(garment.tpose(self.betas)).to(self.dtype)
         weights = torch.as_tensor(garment.lbs_weights).to(self.dtype)
         shift = torch.as_tensor(self.translation[frame] - origin).to(self.dtype)
-        return (linear_blend_skinning(rest, weights, self._transforms(frame))[0] + shift).to(self.device)
+        return sent(linear_blend_skinning(rest, weights, self._transforms(frame))[0] + shift, self.device)
 
 
 def body_motion(

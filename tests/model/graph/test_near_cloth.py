@@ -6,7 +6,7 @@ import torch
 
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
-from hood.model.graph.near_cloth import find_near_cloth
+from hood.model.graph.builder import find_near_cloth
 from hood.testing import cylinder, grid
 
 RADIUS = 0.03
