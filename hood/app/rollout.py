@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.said import Doubt
 from hood.rollouts.checks.fit import Ease, measure_ease
-from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import RolloutWriter, still_of
 from hood.rollouts.frame import Frame, metric_names
 from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
@@ -161,17 +162,40 @@ def _run_there(
     ready: Setup, asked: RolloutSettings, digest: str, warned: Heard, bar: Bar, advise: bool
 ) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held."""
-    config, scene, stepper = ready.config, ready.scene, ready.stepper
+    config = ready.config
     folder = output_folder(config)
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
     interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
-    summary = summarise(folder / "rollout.h5")
+    data = read_rollout(folder / "rollout.h5")
+    exported: Sequence[str] = []
+    try:
+        with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn
+            judged = beside.submit(summarise, data)
+            if not interrupted:
+                _draw(config, data, folder, bar)
+                exported = export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config))
+    finally:
+        summary = _conclude(ready, folder, data, judged.result(), eases, advise)
+        summary["warnings"] = list(warned)
+        _write_json(folder / "summary.json", summary)
+    _tell(exported)
+    say(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    if interrupted:
+        say(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", error=True)
+    return summary, interrupted
+
+
+def _conclude(
+    ready: Setup, folder: Path, data: RolloutData, summary: dict[str, Any], eases: list[Ease | None], advise: bool
+) -> dict[str, Any]:
+    """What there is to say of a rollout that is there; returns all of it for ``summary.json``."""
+    config, scene, simulator = ready.config, ready.scene, network_of(ready.stepper)
     if eases:
         summary |= summarise_ease(eases[0], eases[-1])
     if scene.holding is not None:
-        summary |= summarise_held(scene, read_rollout(folder / "rollout.h5"))
+        summary |= summarise_held(scene, data)
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
@@ -182,19 +206,8 @@ def _run_there(
     _tell(plan_sentences(summary))
     if advise:
         _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5", scene.cloth.num_vertices)))
-    simulator = network_of(stepper)
-    try:
-        if not interrupted:
-            _draw(config, folder, bar)
-            _tell(export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config)))
-    finally:
-        summary["kernels"] = None if simulator is None else simulator.network.kernels
-        summary["warnings"] = list(warned)
-        _write_json(folder / "summary.json", summary)
-    say(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    if interrupted:
-        say(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", error=True)
-    return summary, interrupted
+    summary["kernels"] = None if simulator is None else simulator.network.kernels
+    return summary
 
 
 def _run_all(config: RolloutSettings, jobs: list[Job], output: Path, bar: Bar) -> _Made:
@@ -314,24 +327,24 @@ def _simulate_to_disk(
     return False
 
 
-def _draw(config: RolloutSettings, folder: Path, bar: Bar) -> None:
-    """Contact sheet and video, when the picture libraries are installed."""
+def _draw(config: RolloutSettings, data: RolloutData, folder: Path, bar: Bar) -> None:
+    """Video and contact sheet, when the picture libraries are installed."""
     kind, stride = video_of(config)
     if kind == "none" and not bool(config.sheet):
         return
     try:
-        from hood.media.film import write_sheet, write_video
+        from hood.media.film import Film, sheet_frames, write_sheet, write_video
     except ImportError as error:
         say(f"no pictures: {error}", error=True)
         return
-    data, colour, thinner = read_rollout(folder / "rollout.h5"), str(config.colour), thinning(config)
-    textures = lay_on(read_textures(config), [data])[0]
-    if bool(config.sheet):
-        write_sheet(data, folder / "contact_sheet.png", colour, thinner, textures)
+    film = Film(data, colour=str(config.colour), thinner=thinning(config), textures=lay_on(read_textures(config), [data])[0])
+    pictures: dict[int, Any] = {}
     if kind != "none":
         chosen = range(0, len(data.cloth_pos), stride)
-        frames = bar(chosen, len(chosen), "video")
-        write_video(data, folder / f"rollout.{kind}", frames, stride, colour, thinner, textures)
+        kept = sheet_frames(len(data.cloth_pos)) if bool(config.sheet) else ()
+        _, pictures = write_video(film, folder / f"rollout.{kind}", bar(chosen, len(chosen), "video"), stride, kept)
+    if bool(config.sheet):
+        write_sheet(film, folder / "contact_sheet.png", pictures)
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

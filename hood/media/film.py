@@ -114,10 +114,12 @@ class Film:
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture
 
-    def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6) -> np.ndarray:
-        """Contact sheet of ``count`` evenly spaced frames."""
-        chosen = sheet_frames(len(self.data.cloth_pos), count)
-        return contact_sheet(list(drawn(self, chosen)), columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
+    def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6, known: Mapping[int, np.ndarray] | None = None) -> np.ndarray:
+        """Contact sheet of ``count`` evenly spaced frames; ``known`` are pictures that are there already, by their frames."""
+        chosen, known = sheet_frames(len(self.data.cloth_pos), count), known or {}
+        missing = [index for index in chosen if index not in known]
+        pictures = dict(known) | dict(zip(missing, drawn(self, missing), strict=True))
+        return contact_sheet([pictures[i] for i in chosen], columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
 
 
 def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
@@ -125,37 +127,30 @@ def sheet_frames(num_frames: int, count: int = _SHEET_FRAMES) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, num_frames - 1, min(count, num_frames)).round()})
 
 
-def write_sheet(
-    data: RolloutData,
-    path: Path,
-    colour: str = "none",
-    thinner: float = 0.0,
-    textures: Mapping[str, Texture] | None = None,
-) -> Path:
-    """Contact sheet of the rollout as PNG; ``colour``, ``thinner`` and ``textures`` as in :class:`Film`."""
-    return save_png(path, Film(data, colour=colour, thinner=thinner, textures=textures).sheet())
+def write_sheet(film: Film, path: Path, known: Mapping[int, np.ndarray] | None = None) -> Path:
+    """Contact sheet of a film as PNG; ``known`` as in :meth:`Film.sheet`."""
+    return save_png(path, film.sheet(known=known))
 
 
 def write_video(
-    data: RolloutData,
-    path: Path,
-    frames: Iterable[int] | None = None,
-    stride: int = 1,
-    colour: str = "none",
-    thinner: float = 0.0,
-    textures: Mapping[str, Texture] | None = None,
-) -> Path:
-    """Video of the rollout at its own speed; every ``stride``-th frame is drawn. Returns the file written.
+    film: Film, path: Path, frames: Iterable[int] | None = None, stride: int = 1, kept: Sequence[int] = ()
+) -> tuple[Path, dict[int, np.ndarray]]:
+    """Video at the rollout's own speed; every ``stride``-th frame is drawn.
 
-    ``frames`` is the iterable that drives the loop (a progress bar, say); all frames by default.
+    Args:
+        frames: the iterable that drives the loop (a progress bar, say); all frames by default.
+
+    Returns:
+        The file written, and the pictures of the frames ``kept`` that it holds.
     """
-    film = Film(data, colour=colour, thinner=thinner, textures=textures)
-    step = seconds_per_frame(data)
-    chosen: Sequence[int] | Iterable[int] = range(0, len(data.cloth_pos), stride) if frames is None else frames
-    with VideoWriter(path, fps=1.0 / (step * stride)) as writer:
-        for picture in drawn(film, chosen):
+    every = range(0, len(film.data.cloth_pos), stride)
+    pictures: dict[int, np.ndarray] = {}
+    with VideoWriter(path, fps=1.0 / (seconds_per_frame(film.data) * stride)) as writer:
+        for index, picture in zip(every, drawn(film, every if frames is None else frames), strict=False):
             writer.append(picture)
-    return writer.path
+            if index in kept:
+                pictures[index] = picture
+    return writer.path, pictures
 
 
 def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:

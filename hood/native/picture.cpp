@@ -100,6 +100,46 @@ void picture_rasterise(const double* screen, const double* nearness, const int64
     }
 }
 
+// Unit normals (V, 3) of vertices, zero at the start: of faces by their areas.
+void picture_normals(const double* pos, const int64_t* faces, int64_t num_faces, int64_t num_vertices, double* out) {
+    for (int64_t f = 0; f < num_faces; ++f) {
+        const int64_t* corner = faces + 3 * f;
+        const Vec a = at(pos, corner[0]), normal = cross(at(pos, corner[1]) - a, at(pos, corner[2]) - a);
+        for (int k = 0; k < 3; ++k) {
+            double* sum = out + 3 * corner[k];
+            sum[0] += normal.x, sum[1] += normal.y, sum[2] += normal.z;
+        }
+    }
+    for (int64_t v = 0; v < num_vertices; ++v) {
+        const Vec normal = unit(at(out, v));
+        out[3 * v] = normal.x, out[3 * v + 1] = normal.y, out[3 * v + 2] = normal.z;
+    }
+}
+
+// Shade of faces on the floor below them, by cells (cells, cells) of z and x about the middle, zero at the start.
+void picture_low(const double* pos, const int64_t* faces, int64_t num_faces, const double* middle, double floor, double cell, int64_t cells,
+                 double* out) {
+    for (int64_t f = 0; f < num_faces; ++f) {
+        const Vec a = at(pos, faces[3 * f]), b = at(pos, faces[3 * f + 1]), c = at(pos, faces[3 * f + 2]);
+        const Vec there = 1.0 / 3.0 * (a + b + c);
+        const double share = std::fabs(cross(b - a, c - a).y) * std::exp(-std::max(there.y - floor, 0.0) / 0.12);
+        const auto place = [&](double v) { return (int64_t)clip(v / cell + cells / 2, 0.0, cells - 1.0); };
+        out[place(there.z - middle[2]) * cells + place(there.x - middle[0])] += 0.25 / (cell * cell) * share;
+    }
+}
+
+// The most of a map (size, size) in every tile of 16 x 16: (size / 16, size / 16), minus infinity at the start.
+void picture_most(const double* map, int64_t size, double* out) {
+    const int64_t tiles = size / 16;
+    for (int64_t row = 0; row < size; ++row)
+        for (int64_t tile = 0; tile < tiles; ++tile) {
+            const double* first = map + row * size + 16 * tile;
+            double most = out[row / 16 * tiles + tile];
+            for (int i = 0; i < 16; ++i) most = first[i] > most ? first[i] : most;
+            out[row / 16 * tiles + tile] = most;
+        }
+}
+
 }  // extern "C"
 
 namespace {
@@ -136,17 +176,20 @@ double openness(const Seen& s, const float* depths, int64_t row, int64_t column,
     const double reach = s.focal * s.reach / depth;
     const int64_t place = 2 * (row % 2) + column % 2;
     double kept = 0.0;
-    for (int64_t i = 0; i < 2 * s.num_around; ++i) {
-        const int64_t k = i % s.num_around;
-        const double* offset = s.around + 2 * s.num_around * (i < s.num_around ? place : 3 - place);
-        const int64_t c = (int64_t)std::floor(column + 0.5 + reach * offset[2 * k]);
-        const int64_t r = (int64_t)std::floor(row + 0.5 + reach * offset[2 * k + 1]);
-        if (c < 0 || r < 0 || c >= s.width || r >= s.height) continue;
-        const double there = depths[r * s.width + c];
-        const double dx = (c + 0.5 - across) * per_pixel * there - x, dy = (up - r - 0.5) * per_pixel * there - y, dz = there - depth;
-        const double dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq * per_reach, above = n[0] * dx + n[1] * dy + n[2] * dz;
-        if (there == 0.0 || far >= 1.0 || !(above > 0.0)) continue;
-        kept += std::max(above / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
+    for (const int64_t ring : {place, 3 - place}) {
+        const double* offset = s.around + 2 * s.num_around * ring;
+        for (const double* end = offset + 2 * s.num_around; offset < end; offset += 2) {
+            const int64_t c = (int64_t)std::floor(column + 0.5 + reach * offset[0]);
+            const int64_t r = (int64_t)std::floor(row + 0.5 + reach * offset[1]);
+            if (c < 0 || r < 0 || c >= s.width || r >= s.height) continue;
+            const double there = depths[r * s.width + c];
+            const double dx = (c + 0.5 - across) * per_pixel * there - x, dy = (up - r - 0.5) * per_pixel * there - y;
+            const double dz = there - depth, dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq * per_reach;
+            const double above = n[0] * dx + n[1] * dy + n[2] * dz;
+            // Few places are so high above the tangent plane; only there a root is needed.
+            if (there == 0.0 || far >= 1.0 || !(above > 0.0) || above * above < 0.00999 * dist_sq) continue;
+            kept += std::max(above / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
+        }
     }
     return clip(1.0 - 1.1 * kept / s.num_around, 0.2, 1.0);
 }
@@ -294,22 +337,22 @@ void background(const Light& light, const Floor& f, const Sky& sky, Steep& steep
 
 // The numbers 0 to 255 by which linear colours are shown.
 struct Shown {
-    double least[257];    // from which a number is shown
-    uint8_t guess[1025];  // the number at the beginning of every 1024th
+    static constexpr int STEPS = 1024;  // of the root of a colour; no step holds the limits of two numbers
+    double least[257];                  // from which a number is shown
+    uint8_t guess[STEPS + 1];           // the number at the beginning of every step
 
     Shown() {
         for (int k = 0; k < 257; ++k) least[k] = k == 0 ? -1.0 : k == 256 ? 2.0 : std::pow((k - 0.5) / 255.0, 2.2);
-        for (int i = 0, k = 0; i < 1025; ++i) {
-            while (least[k + 1] <= i / 1024.0) ++k;
+        for (int i = 0, k = 0; i <= STEPS; ++i) {
+            while (std::sqrt(std::max(least[k + 1], 0.0)) * STEPS <= i) ++k;
             guess[i] = (uint8_t)k;
         }
     }
     uint8_t operator()(double color) const {
         const double shown = clip(color, 0.0, 1.0);
-        int k = guess[(int)(1024.0 * shown)];
-        k += least[k + 1] <= shown;  // without a branch: rarely is there more than one between two entries
-        while (least[k + 1] <= shown) ++k;
-        return (uint8_t)k;
+        int k = guess[(int)(STEPS * std::sqrt(shown))];
+        k += least[k + 1] <= shown;  // without a branch
+        return (uint8_t)(k - (least[k] > shown));
     }
 };
 

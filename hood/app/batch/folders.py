@@ -23,6 +23,7 @@ from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.automatic import AUTO
 from hood.app.stepping.steppers import GROUP, with_stepper
 from hood.assets.files.library import locate, names
+from hood.rollouts.file.reader import read_rollout
 
 #: Instead of a digest: the motion is in no file that can be read.
 NO_FILE = "none"
@@ -174,7 +175,7 @@ def finished(config: RolloutSettings, digest: str, folder: Path) -> dict[str, An
         return None
     if attributes is None or attributes["checkpoint_sha256"] != digest or _other_settings(config, attributes):
         return None
-    return summary if {"sound", "doubts"} <= set(summary) else summarise(folder / "rollout.h5")
+    return summary if {"sound", "doubts"} <= set(summary) else summarise(read_rollout(folder / "rollout.h5"))
 
 
 def made_otherwise(config: RolloutSettings, folder: Path) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,13 +22,12 @@ from hood.app.settings.record import read_settings
 from hood.app.stepping.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.app.stepping.guarding import summarise_guard
 from hood.app.stepping.refinement import describe_refinement, summarise_refinement
-from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.reader import RolloutData
 from hood.solver.step_figures import MET, count_reasons, name_counts
 
 
-def summarise(path: Path) -> dict[str, Any]:
-    """Summary of a rollout file: strain, penetration, surface, times, first non-finite frame; None if not measured."""
-    data = read_rollout(path)
+def summarise(data: RolloutData) -> dict[str, Any]:
+    """Summary of a rollout: strain, penetration, surface, times, first non-finite frame; None if not measured."""
     finite = data.step_finite
     metrics = defaultdict(lambda: np.full(len(finite), np.nan), data.step_metrics)
     # The first step makes tables as well: it counts only where there is no other.

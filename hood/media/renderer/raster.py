@@ -10,6 +10,7 @@ Drawing in C++ (``hood/native/picture.cpp``): the pictures of the numpy form, se
 from __future__ import annotations
 
 import ctypes
+import threading
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -72,7 +73,10 @@ def library() -> ctypes.CDLL | None:
     lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 3, REAL, REAL, *[POINTER] * 2]
     lib.picture_lit.argtypes = [POINTER, POINTER, COUNT, REAL, POINTER]
     lib.picture_draw.argtypes = [POINTER] * 4
-    for name in ("picture_rasterise", "picture_lit", "picture_draw"):
+    lib.picture_normals.argtypes = [*[POINTER] * 2, *[COUNT] * 2, POINTER]
+    lib.picture_low.argtypes = [*[POINTER] * 2, COUNT, POINTER, REAL, REAL, COUNT, POINTER]
+    lib.picture_most.argtypes = [POINTER, COUNT, POINTER]
+    for name in ("picture_rasterise", "picture_lit", "picture_draw", "picture_normals", "picture_low", "picture_most"):
         getattr(lib, name).restype = None
     return lib
 
@@ -85,6 +89,21 @@ def packed(values: Any, kind: type = np.float64) -> NDArray[Any]:
 def address(values: NDArray[Any]) -> int:
     """Of an array that :func:`packed` made and that outlives the call."""
     return int(values.ctypes.data)
+
+
+_MEMORY = threading.local()
+
+
+def filled(size: int, value: float, kind: type, place: str | None = None) -> NDArray[Any]:
+    """(size,) of one value; with a ``place`` in memory that this thread keeps for it, and fills anew the next time."""
+    if place is None:
+        return np.full(size, value, dtype=kind)
+    memory = vars(_MEMORY).get(place)
+    if memory is None or memory.size != size:
+        memory = np.empty(size, dtype=kind)
+        setattr(_MEMORY, place, memory)
+    memory.fill(value)
+    return np.asarray(memory)
 
 
 FloatArray = NDArray[np.floating]
@@ -110,6 +129,7 @@ def rasterise(
     width: int,
     height: int,
     chunk_faces: int = 32768,
+    place: str | None = None,
 ) -> VisibilityBuffer:
     """Nearest face of every pixel.
 
@@ -119,9 +139,10 @@ def rasterise(
             perspective, minus the distance under a parallel projection).
         faces: (F, 3) vertex indices; degenerate faces are not drawn.
         chunk_faces: faces expanded at once, a bound on memory.
+        place: of :func:`filled`: what was found there last is overwritten. None: in memory of its own.
     """
-    best = np.full(width * height, -np.inf, dtype=np.float64)
-    owner = np.full(width * height, -1, dtype=np.int32)
+    best = filled(width * height, -np.inf, np.float64, place and f"{place} nearness")
+    owner = filled(width * height, -1, np.int32, place and f"{place} face")
     lib = library()
     if lib is not None:
         points, near, corners = packed(screen), packed(nearness), packed(faces, np.int64)

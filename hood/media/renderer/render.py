@@ -280,7 +280,7 @@ class _View:
         faces, depth, focal = surface.faces[number], np.maximum(seen[:, 2], NEAR), camera.focal(height)
         offset = focal * seen[:, :2] / depth[:, None]
         screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
-        buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height)
+        buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height, place="view")
         return cls(number, faces, screen, depth, buffer, focal)
 
     def first(self) -> NDArray[np.int64]:
@@ -353,6 +353,11 @@ def _seen_values(
 
 def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
     """Area-weighted unit normals (V, 3)."""
+    lib = library()
+    if lib is not None:
+        points, corners, found = packed(pos), packed(faces, np.int64), np.zeros_like(pos)
+        lib.picture_normals(address(points), address(corners), len(corners), len(points), address(found))
+        return found
     a, b, c = (pos[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
     total = [

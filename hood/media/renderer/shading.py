@@ -120,9 +120,14 @@ class Surface:
 
 def _most_near(nearness: FloatArray) -> _Array:
     """(H / 16, W / 16), the most of a map (H, W) in every tile and those around it."""
-    tiles = np.full([len(nearness) // _TILE + 2] * 2, -np.inf)
-    rows = nearness.reshape(-1, _TILE, len(nearness)).max(axis=1)
-    tiles[1:-1, 1:-1] = rows.reshape(len(rows), -1, _TILE).max(axis=2)
+    tiles, lib, count = np.full([len(nearness) // _TILE + 2] * 2, -np.inf), library(), len(nearness) // _TILE
+    if lib is not None:
+        most = np.full((count, count), -np.inf)
+        lib.picture_most(address(nearness), len(nearness), address(most))
+        tiles[1:-1, 1:-1] = most
+    else:
+        rows = nearness.reshape(-1, _TILE, len(nearness)).max(axis=1)
+        tiles[1:-1, 1:-1] = rows.reshape(count, count, _TILE).max(axis=2)
     rows = np.maximum(np.maximum(tiles[:-2], tiles[1:-1]), tiles[2:])
     return packed(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))
 
@@ -141,7 +146,7 @@ class Light:
         extent = float((seen[:, :2].max(axis=0) - self._low).max()) + 1e-6
         self._scale = (_SHADOW_SIZE - 8) / extent
         screen = (seen[:, :2] - self._low) * self._scale + 4.0
-        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE).nearness
+        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE, place="shadow").nearness
         self._texel = 1.0 / self._scale
         self._most = _most_near(self._map)
 
@@ -257,16 +262,25 @@ def _floor_shadow(light: Light, surface: Surface, pos: _Array, floor: float, awa
 
 def dark_map(surface: Surface, floor: float) -> _Array:
     """Shade under low parts, (_DARK_SIZE, _DARK_SIZE) cells of _CELL along z and x about the surface's middle."""
-    center = _middle(surface)
+    center, lib = _middle(surface), library()
+    if lib is not None:
+        low = np.zeros((_DARK_SIZE, _DARK_SIZE))
+        faces = address(surface.faces), len(surface.faces)
+        lib.picture_low(address(surface.pos), *faces, address(center), floor, _CELL, _DARK_SIZE, address(low))
+    else:
+        low = _low(surface, floor, center)
+    narrow, broad = (gaussian_filter(low, sigma, mode="constant", truncate=3.0) for sigma in (1.4, 4.0))
+    return packed(0.55 * narrow + 0.6 * broad)
+
+
+def _low(surface: Surface, floor: float, center: _Array) -> _Array:
     a, b, c = (surface.pos[surface.faces[:, k]] for k in range(3))
     middle = (a + b + c) / 3.0
     area = 0.25 * np.abs(np.cross(b - a, c - a)[:, 1])
     weight = area / _CELL**2 * np.exp(-np.maximum(middle[:, 1] - floor, 0.0) / 0.12)
     at = np.clip((middle[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2, 0, _DARK_SIZE - 1).astype(np.int64)
     flat = np.bincount(at[:, 0] * _DARK_SIZE + at[:, 1], weights=weight, minlength=_DARK_SIZE * _DARK_SIZE)
-    low = flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
-    narrow, broad = (gaussian_filter(low, sigma, mode="constant", truncate=3.0) for sigma in (1.4, 4.0))
-    return packed(0.55 * narrow + 0.6 * broad)
+    return flat.astype(np.float64).reshape(_DARK_SIZE, _DARK_SIZE)
 
 
 def _middle(surface: Surface) -> _Array:
