@@ -21,7 +21,7 @@ MODULES = {
     "hood/evaluation/table.py": "the rows of one table, and their text and files",
     "hood/model/kernels/triton_step.py": "the operators of one processor step in Triton and their gradients",
     "hood/media/renderer/render.py": "one picture: body, cloth, hem lines and prints",
-    "hood/media/renderer/shading.py": "the light on a surface and on the floor below it, and its values for the compiled drawing",
+    "hood/media/renderer/shading.py": "the light on a surface and on the floor below it, and its compiled form",
     "hood/media/viewer/page.py": "one page: what it packs and what it names",
     "hood/mesh/closest_point/search.py": "one search: candidates, closest points, signs by pseudonormals",
     "hood/mesh/closest_point/tree.py": "the same search by a compiled tree, with everything that it keeps of a surface",
