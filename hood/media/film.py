@@ -118,7 +118,7 @@ class Film:
         """Contact sheet of ``count`` evenly spaced frames; ``known`` are pictures that are there already, by their frames."""
         chosen, known = sheet_frames(len(self.data.cloth_pos), count), known or {}
         missing = [index for index in chosen if index not in known]
-        pictures = dict(known) | dict(zip(missing, drawn(self, missing), strict=True))
+        pictures = {**known, **dict(drawn(self, missing))}
         return contact_sheet([pictures[i] for i in chosen], columns, [f"{self.data.time[i]:.2f} s" for i in chosen])
 
 
@@ -143,31 +143,32 @@ def write_video(
     Returns:
         The file written, and the pictures of the frames ``kept`` that it holds.
     """
-    every = range(0, len(film.data.cloth_pos), stride)
+    chosen = range(0, len(film.data.cloth_pos), stride) if frames is None else frames
     pictures: dict[int, np.ndarray] = {}
     with VideoWriter(path, fps=1.0 / (seconds_per_frame(film.data) * stride)) as writer:
-        for index, picture in zip(every, drawn(film, every if frames is None else frames), strict=False):
+        for index, picture in drawn(film, chosen):
             writer.append(picture)
             if index in kept:
                 pictures[index] = picture
     return writer.path, pictures
 
 
-def drawn(film: Film, frames: Iterable[int]) -> Iterator[np.ndarray]:
-    """Pictures (H, W, 3) uint8 of frames, in their order; drawn some frames ahead, by as many threads as this process may use
-    processors, up to :data:`_THREADS`: no picture depends on their number."""
+def drawn(film: Film, frames: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Frames and their pictures (H, W, 3) uint8, in their order; drawn some frames ahead, by as many threads as this process may
+    use processors, up to :data:`_THREADS`: no picture depends on their number."""
     threads = min(_THREADS, _processors())
     if threads == 1:
-        yield from map(film.frame, frames)
+        yield from ((index, film.frame(index)) for index in frames)
         return
     with ThreadPoolExecutor(threads) as pool:
-        ahead: deque[Future[np.ndarray]] = deque()
+        ahead: deque[tuple[int, Future[np.ndarray]]] = deque()
         for index in frames:
-            ahead.append(pool.submit(film.frame, index))
+            ahead.append((index, pool.submit(film.frame, index)))
             if len(ahead) > threads:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
+                first, picture = ahead.popleft()
+                yield first, picture.result()
+        for first, picture in ahead:
+            yield first, picture.result()
 
 
 def _processors() -> int:

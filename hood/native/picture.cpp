@@ -9,6 +9,7 @@
 namespace {
 
 inline double clip(double v, double low, double high) { return std::min(std::max(v, low), high); }
+constexpr int64_t TILE = 16;  // pixels of a tile of the shadow map, as in shading.py
 inline Vec unit(Vec a) { return (1.0 / std::max(std::sqrt(dot(a, a)), 1e-12)) * a; }
 
 }  // namespace
@@ -18,7 +19,7 @@ extern "C" {
 // As `LightValues` of hood/media/renderer/raster.py.
 struct Light {
     const double* map;     // (size, size) nearness of what the key light sees
-    const double* most;    // (tiles, tiles) the most of it from a tile before each tile of 16 x 16 to one behind
+    const double* most;    // (tiles, tiles) the most of it from a tile before each tile to one behind
     const double* probes;  // (num_probes, 2) texels
     const double* axes;    // (3, 3) of the key light's view
     int64_t size, num_probes, tiles;
@@ -128,15 +129,15 @@ void picture_low(const double* pos, const int64_t* faces, int64_t num_faces, con
     }
 }
 
-// The most of a map (size, size) in every tile of 16 x 16: (size / 16, size / 16), minus infinity at the start.
+// The most of a map (size, size) in every tile: (size / TILE, size / TILE), minus infinity at the start.
 void picture_most(const double* map, int64_t size, double* out) {
-    const int64_t tiles = size / 16;
+    const int64_t tiles = size / TILE;
     for (int64_t row = 0; row < size; ++row)
         for (int64_t tile = 0; tile < tiles; ++tile) {
-            const double* first = map + row * size + 16 * tile;
-            double most = out[row / 16 * tiles + tile];
-            for (int i = 0; i < 16; ++i) most = first[i] > most ? first[i] : most;
-            out[row / 16 * tiles + tile] = most;
+            const double* first = map + row * size + TILE * tile;
+            double most = out[row / TILE * tiles + tile];
+            for (int i = 0; i < TILE; ++i) most = first[i] > most ? first[i] : most;
+            out[row / TILE * tiles + tile] = most;
         }
 }
 
@@ -150,7 +151,7 @@ double lit_at(const Light& light, Vec p, double spread) {
     const double across = (seen[0] - light.low[0]) * light.scale + 4.0, down = (seen[1] - light.low[1]) * light.scale + 4.0;
     const double bound = 0.004 + 1.5 * spread * light.texel - seen[2], most = light.size - 1.0, edge = 4.0 * spread;
     if (across < -edge || down < -edge || across > most + edge || down > most + edge) return 1.0;  // the map's rim is empty
-    const int64_t tile = ((int64_t)clip(down, 0.0, most) >> 4) * light.tiles + ((int64_t)clip(across, 0.0, most) >> 4);
+    const int64_t tile = (int64_t)clip(down, 0.0, most) / TILE * light.tiles + (int64_t)clip(across, 0.0, most) / TILE;
     if (!(light.most[tile] > bound)) return 1.0;
     int64_t covered = 0;
     for (int64_t i = 0; i < light.num_probes; ++i) {
@@ -186,8 +187,7 @@ double openness(const Seen& s, const float* depths, int64_t row, int64_t column,
             const double dx = (c + 0.5 - across) * per_pixel * there - x, dy = (up - r - 0.5) * per_pixel * there - y;
             const double dz = there - depth, dist_sq = dx * dx + dy * dy + dz * dz, far = dist_sq * per_reach;
             const double above = n[0] * dx + n[1] * dy + n[2] * dz;
-            // Few places are so high above the tangent plane; only there a root is needed.
-            if (there == 0.0 || far >= 1.0 || !(above > 0.0) || above * above < 0.00999 * dist_sq) continue;
+            if (there == 0.0 || far >= 1.0 || !(above > 0.0)) continue;
             kept += std::max(above / std::sqrt(dist_sq) - 0.1, 0.0) * (1.0 - far);
         }
     }

@@ -85,12 +85,9 @@ def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dt
             value = (value if device is None else sent(value, device)).to(dtype=None if keep else dtype)
         moved[spec.name] = value
     made = type(item)(**moved)
-    vars(made).update({name: value for name, value in vars(item).items() if name not in moved and not _holds_tensors(value)})
+    known = {name: value for name, value in vars(item).items() if name not in moved and isinstance(value, (bool, int, float))}
+    vars(made).update(known)
     return made
-
-
-def _holds_tensors(value: Any) -> bool:
-    return not isinstance(value, (bool, int, float))
 
 
 def forget(kept: MutableMapping[Any, Any], key: Any) -> Callable[[Any], None]:

@@ -52,6 +52,10 @@ class Signal:
         return torch.ones_like(residual) if self._name == "potential" else 1.0 / (1.0 + residual / 3.0)
 
 
+#: Columns of :attr:`Update.told` where the device decides.
+TOLD = 9
+
+
 class Figures(NamedTuple):
     """What the host is told of an update."""
 
@@ -88,7 +92,7 @@ class Update:
     next_vel: Tensor  # (V, 3) m/s
     measured: Tensor  # (M,) means of the energies in the order of ``energies``, then what :data:`MEASURED` says
     energies: tuple[str, ...]
-    told: Tensor  # (B, 4) :func:`outcome_of`, or (B, 9) with whether the scene counts, whether it is finite, and what was found
+    told: Tensor  # (B, 4) :func:`outcome_of`, or (B, TOLD): as well whether it counts, is finite, what was found
     backward: Callable[[], None] | None = None  # computes the gradients, where that is not done
     acceptance: Acceptance | None = None  # None: the host decides
     plans: Sequence[Any] = ()  # by scene: what the places belong to

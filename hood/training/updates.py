@@ -27,7 +27,7 @@ from hood.steppers.static_shapes.problem import altered, problem_from, settled_p
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
 from hood.tensors.precision import products
 from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
-from hood.training.outcome import Acceptance, Figures, Signal, Update, figures_of, outcome_of
+from hood.training.outcome import TOLD, Acceptance, Figures, Signal, Update, figures_of, outcome_of
 from hood.training.settings import TrainerSettings
 from hood.training.slots import TrainingStep
 
@@ -103,8 +103,6 @@ def plain_update(
 #: Scenes of an update that graphs take one after the other, unless asked for. To start the 6,000 kernels of a plain update
 #: takes about as long as eight graphs of 1,000 vertices are computed; that follows from counts and was not measured.
 MOST_SCENES = 8
-#: Columns of :attr:`Update.told`.
-_TOLD = 9
 
 
 class CapturedUpdates:
@@ -147,7 +145,7 @@ class CapturedUpdates:
         numbers, verdicts, gradient = (
             _stacked([getattr(one, name) for one in outcomes]) for name in ("numbers", "acceptance", "gradient")
         )
-        (goes_on, used, counts), measured = verdicts.unbind(dim=1), numbers[:, :-_TOLD]
+        (goes_on, used, counts), measured = verdicts.unbind(dim=1), numbers[:, :-TOLD]
         if len(outcomes) > 1:
             gradient = gradient.sum(dim=0) / used.sum().clamp_min(1)
             measured = torch.where(counts.unsqueeze(1), measured, 0.0).sum(dim=0) / counts.sum()
@@ -162,7 +160,7 @@ class CapturedUpdates:
             _joined([one.next_vel for one in outcomes]),
             measured,
             outcomes[0].energies,
-            numbers[:, -_TOLD:],
+            numbers[:, -TOLD:],
             acceptance=Acceptance(goes_on, usable),
             plans=[plan for plan, _, _ in asked],
         )

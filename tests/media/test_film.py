@@ -82,7 +82,9 @@ def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, mon
 
     monkeypatch.setattr("hood.media.film._processors", lambda: threads)
     monkeypatch.setattr(film, "frame", seen)
-    found = list(drawn(film, iter((6, 0, 3, 3, 1))))
+    pairs = list(drawn(film, iter((6, 0, 3, 3, 1))))
+    assert [index for index, _ in pairs] == [6, 0, 3, 3, 1]
+    found = [picture for _, picture in pairs]
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
     assert len(used) == threads
     assert (threading.get_ident() in used) == (threads == 1)

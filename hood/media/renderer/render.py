@@ -178,7 +178,7 @@ def render_frame(
             not move.
     """
     surface = _join(meshes)
-    light = Light(camera, surface.pos, surface.faces)
+    light = Light(camera, surface.pos, surface.faces, place="shadow")
     floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
     firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
     prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]

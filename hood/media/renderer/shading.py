@@ -89,7 +89,7 @@ def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer],
 _Faces = NDArray[np.int64]
 
 _DARK_SIZE, _CELL = 128, 0.03  # cells of the map of shade on the floor along a side, and the side of one [m]
-_SHADOW_SIZE, _TILE = 640, 16  # pixels of the shadow map, and of a tile of it
+_SHADOW_SIZE, _TILE = 640, 16  # pixels of the shadow map, and of a tile of it, as in picture.cpp
 # Where the shadow map is probed around a point, in texels: two rings, turned against each other.
 _PROBES = (
     (0.0, 0.0), (1.7, 0.6), (-0.6, 1.7), (-1.7, -0.6), (0.6, -1.7), (3.0, -2.4), (2.4, 3.0), (-3.0, 2.4),
@@ -133,9 +133,14 @@ def _most_near(nearness: FloatArray) -> _Array:
 
 
 class Light:
-    """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim."""
+    """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim.
 
-    def __init__(self, camera: Camera, pos: _Array, faces: NDArray[np.int64]):
+    Args:
+        pos: (V, 3) m of the surface that throws shadows; ``faces`` (F, 3).
+        place: of :func:`hood.media.renderer.raster.filled`, for the shadow map; the next light of that place overwrites it.
+    """
+
+    def __init__(self, camera: Camera, pos: _Array, faces: NDArray[np.int64], place: str | None = None):
         right, _, forward = camera.axes()
         flat_forward = unit(np.array([forward[0], 0.0, forward[2]]) + 1e-9)
         self.key = unit(-0.55 * right + 1.0 * np.array([0.0, 1.0, 0.0]) - 0.75 * flat_forward)
@@ -146,7 +151,7 @@ class Light:
         extent = float((seen[:, :2].max(axis=0) - self._low).max()) + 1e-6
         self._scale = (_SHADOW_SIZE - 8) / extent
         screen = (seen[:, :2] - self._low) * self._scale + 4.0
-        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE, place="shadow").nearness
+        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE, place=place).nearness
         self._texel = 1.0 / self._scale
         self._most = _most_near(self._map)
 
