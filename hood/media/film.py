@@ -154,8 +154,8 @@ def write_video(
 
 
 def drawn(film: Film, frames: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Frames and their pictures (H, W, 3) uint8, in their order; drawn some frames ahead, by as many threads as this process may
-    use processors, up to :data:`_THREADS`: no picture depends on their number."""
+    """Frames and their pictures (H, W, 3) uint8, in their order; drawn some frames ahead, by as many threads as this process
+    may use processors, up to :data:`_THREADS`: no picture depends on their number."""
     threads = min(_THREADS, _processors())
     if threads == 1:
         yield from ((index, film.frame(index)) for index in frames)
