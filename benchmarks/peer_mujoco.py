@@ -7,7 +7,7 @@ How hood's fabric is said in MuJoCo's terms:
   its law is St. Venant-Kirchhoff's, as hood's is.
 - bending: a flex bends as the solid of its thickness does, E h³ / (12 (1 - ν²)); hood's fabric has a stiffness of its own. The
   compiled coefficients are multiplied so that a sheet on a wide cylinder feels as great a force as hood's: :func:`bend_factor`.
-- no damping, no contact of cloth with cloth.
+- no damping; contact of cloth with cloth, where it is asked for, is MuJoCo's own, hard from 3 mm.
 
 Integrator ``discrete`` treats elasticity implicitly, ``Euler`` does not and needs shorter steps.
 """
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from peer_scenes import CONTACT_RADIUS, FPS, GRAVITY, CannotDoError, Moment, Setting, membrane
+from peer_scenes import CONTACT_RADIUS, FPS, FRICTION, GRAVITY, LAYER_REACH, CannotDoError, Moment, Setting, membrane
 
 from hood.cloth.state import State, StepInput
 from hood.energies.bending import Bending
@@ -66,13 +66,14 @@ def model_of(setting: Setting, effort: Effort, elastic: str) -> Any:
     points = " ".join(f"{value:.9g}" for value in setting.cloth.rest_pos.reshape(-1).tolist())
     elements = " ".join(map(str, setting.cloth.faces.reshape(-1).tolist()))
     held = " ".join(map(str, np.flatnonzero(setting.pinned)))
+    touch, how, radius = (1, "auto", 0.5 * LAYER_REACH) if setting.self_contact else (0, "none", CONTACT_RADIUS)
     text = f"""
 <mujoco>
   <option gravity="0 {-GRAVITY} 0" timestep="{1.0 / FPS / effort.substeps}" integrator="{effort.integrator}"/>
   <size memory="2G"/>
   <worldbody>
-    <flexcomp name="cloth" type="direct" dim="2" mass="1" radius="{CONTACT_RADIUS}" point="{points}" element="{elements}">
-      <contact contype="0" conaffinity="0" selfcollide="none"/>
+    <flexcomp name="cloth" type="direct" dim="2" mass="1" radius="{radius}" point="{points}" element="{elements}">
+      <contact contype="{touch}" conaffinity="{touch}" selfcollide="{how}" friction="{FRICTION}"/>
       <edge equality="false"/>
       <elasticity young="{law.young / thickness}" poisson="{law.poisson}" thickness="{thickness}" elastic2d="{elastic}"/>
       <pin id="{held}"/>

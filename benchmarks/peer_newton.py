@@ -1,4 +1,4 @@
-"""Cloth of NVIDIA Newton in the scenes of benchmarks/peers.py: its solvers VBD and XPBD, on a CPU.
+"""Cloth of NVIDIA Newton in the scenes of benchmarks/peers.py: its solvers VBD, XPBD and Style3D, on a CPU.
 
 How hood's fabric is said in Newton's terms:
 
@@ -7,9 +7,13 @@ How hood's fabric is said in Newton's terms:
 - VBD's bending is hood's, hinge by hinge: edge_ke = k l₀ / (4 (A₁ + A₂)).
 - XPBD has no membrane: springs along the edges, of E h Σ A / l², and bending. The gradient of the angle that its kernel takes
   is 2 A times the angle's, with A the area of a face; edge_ke is divided by A₁ + A₂ for that.
+- Style3D: weft and warp as stiff as a free strip, E h, and shear h μ; bending flat at rest; see ``peer_style3d.py``.
 - contact: radius of the particles 2 mm; soft_contact_ke as :func:`peer_scenes.contact_stiffness`, linear where hood's is
-  quadratic; friction with the same coefficient and, in VBD, the same speed below which it counts as static.
-- no damping (tri_kd, edge_kd, soft_contact_kd are 0), no contact of cloth with cloth.
+  quadratic; friction with the same coefficient and, but for XPBD, the same speed below which it counts as static.
+- contact of cloth with cloth, where it is asked for, sets in at 3 mm, as hood's. VBD's is as stiff as that with the body. It
+  stops vertices that move farther in a step than a share of what it searches, so it searches as far as 3 m/s need. Style3D's
+  takes its stiffness from the matrix of the step. XPBD's is between particles, which leaves the faces between them open.
+- no damping (tri_kd, edge_kd, soft_contact_kd are 0), but for what Style3D does to velocities.
 
 The body is one mesh shape whose vertices and their velocities are set in every substep, in between frames on a straight line.
 """
@@ -21,13 +25,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
+import peer_style3d
 from peer_scenes import (
     CONTACT_RADIUS,
     FPS,
     FRICTION,
     GRAVITY,
+    LAYER_REACH,
     SLIP_SPEED,
+    CannotDoError,
     Moment,
     Setting,
     contact_stiffness,
@@ -35,31 +41,30 @@ from peer_scenes import (
     membrane,
     spring_stiffness,
 )
-from scipy import optimize
-from torch import Tensor
-
-from hood.energies.membrane import green_strain
-from hood.energies.potential import Potential, scale
-from hood.energies.problem import StepProblem, sum_per_scene
 
 #: The weight of hood's contact [J/m³] that contact is made as stiff as.
 COLLISION_WEIGHT = 5e5
+#: Speed [m/s] up to which VBD lets cloth move that it keeps apart.
+_FASTEST = 3.0
 
 
 @dataclass(frozen=True)
 class Effort:
     """How much one frame is worked on."""
 
-    solver: str  # vbd or xpbd
+    solver: str  # vbd, xpbd or style3d
     substeps: int
     iterations: int
     radius: float = CONTACT_RADIUS  # m, of the particles
     surface: bool = False  # contact of edges and faces as well
+    linear: int = 10  # iterations in an iteration of Style3D; 10 is Newton's default
+    self_contact: bool = False  # contact of cloth with cloth
 
     @property
     def name(self) -> str:
         apart = "" if self.radius == CONTACT_RADIUS else f", {1e3 * self.radius:g} mm"
-        return f"{self.solver}{'-surface' * self.surface} {self.substeps}x{self.iterations}{apart}"
+        inner = "" if self.linear == 10 else f"x{self.linear}"
+        return f"{self.solver}{'-surface' * self.surface} {self.substeps}x{self.iterations}{inner}{apart}"
 
 
 def packages() -> tuple[Any, Any]:
@@ -79,9 +84,15 @@ def packages() -> tuple[Any, Any]:
 
 
 class Newton:
-    """A scene in Newton, from frame 0."""
+    """A scene in Newton, from frame 0.
+
+    Raises:
+        CannotDoError: XPBD and contact of cloth with cloth.
+    """
 
     def __init__(self, setting: Setting, effort: Effort) -> None:
+        if effort.self_contact and effort.solver == "xpbd":
+            raise CannotDoError("XPBD in Newton 1.8 keeps particles apart, not the faces between them")
         self.newton, self.warp = packages()
         self.name, self.setting, self.effort = effort.name, setting, effort
         self._frame = 0
@@ -89,28 +100,44 @@ class Newton:
         self.model = self._build()
         self._states = [self.model.state(), self.model.state()]
         self.put(setting.start)
-        options: dict[str, Any] = {"iterations": effort.iterations}
-        if effort.solver == "vbd":
-            options |= {"friction_epsilon": SLIP_SPEED}
-            self.solver = self.newton.solvers.SolverVBD(self.model, **options)
-        else:
-            self.solver = self.newton.solvers.SolverXPBD(self.model, **options)
+        self.solver = self._make_solver()
         self._control = self.model.control()
         self._pipeline: Any = None
-        if self._mesh is not None:
+        if self._mesh is not None or (effort.self_contact and effort.solver == "style3d"):
             surface = {"enable_rigid_soft_full_surface_contact": effort.surface}
             self._pipeline = self.newton.CollisionPipeline(self.model, **surface)
         self._contacts = None if self._pipeline is None else self._pipeline.contacts()
         self._graphs: list[Any] = []
         self._capture()
 
-    def _build(self) -> Any:
-        newton, wp = self.newton, self.warp
-        setting = self.setting
-        law = membrane(setting.fabric)
+    def _make_solver(self) -> Any:
+        effort, solvers = self.effort, self.newton.solvers
+        if effort.solver == "style3d":
+            return peer_style3d.make_solver(self.newton, self.model, effort, self._mesh is not None)
+        if effort.solver == "xpbd":
+            return solvers.SolverXPBD(self.model, iterations=effort.iterations)
+        options: dict[str, Any] = {}
+        if effort.self_contact:
+            # A vertex may move 0.5 * 0.85 times the distance that is searched.
+            reach = 2.0 * _FASTEST / (FPS * effort.substeps * 0.85)
+            options = {
+                "particle_self_contact_margin": LAYER_REACH,
+                "particle_self_contact_gap": max(reach, 1.5 * LAYER_REACH) - LAYER_REACH,
+            }
+        return solvers.SolverVBD(
+            self.model,
+            iterations=effort.iterations,
+            friction_epsilon=SLIP_SPEED,
+            particle_enable_self_contact=effort.self_contact,
+            **options,
+        )
+
+    def _add_cloth(self, builder: Any) -> None:
+        wp, setting, law = self.warp, self.setting, membrane(self.setting.fabric)
         rest, faces = setting.cloth.rest_pos.numpy(), setting.cloth.faces.numpy()
-        builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -GRAVITY, 0.0))
-        vbd = self.effort.solver == "vbd"
+        if self.effort.solver == "style3d":
+            peer_style3d.add_cloth(self.newton, wp, builder, law, rest, faces, self.effort.radius)
+            return
         builder.add_cloth_mesh(
             pos=wp.vec3(0.0, 0.0, 0.0),
             rot=wp.quat_identity(),
@@ -126,10 +153,15 @@ class Newton:
             edge_kd=0.0,
             particle_radius=self.effort.radius,
         )
-        if not vbd:
+        if self.effort.solver == "xpbd":
             ends = setting.cloth.edges.numpy()
             for (a, b), stiffness in zip(ends.tolist(), spring_stiffness(rest, faces, ends, law.young), strict=True):
                 builder.add_spring(a, b, float(stiffness), 0.0, control=0.0)
+
+    def _build(self) -> Any:
+        newton, setting = self.newton, self.setting
+        builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -GRAVITY, 0.0))
+        self._add_cloth(builder)
         contact = contact_stiffness(setting.cloth, COLLISION_WEIGHT)
         if setting.body.shape[1]:
             self._mesh = newton.Mesh(
@@ -137,10 +169,10 @@ class Newton:
             )
             config = newton.ModelBuilder.ShapeConfig(ke=contact, kd=0.0, mu=FRICTION)
             builder.add_shape_mesh(body=-1, mesh=self._mesh, cfg=config)
-        if vbd:
+        if self.effort.solver == "vbd":
             builder.color(include_bending=True)
         model = builder.finalize(device="cpu")
-        model.edge_bending_properties.assign(self._bending(model.edge_indices.numpy(), vbd))
+        model.edge_bending_properties.assign(self._bending(model.edge_indices.numpy()))
         self._hold(model)
         model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = contact, 0.0, FRICTION
         model.particle_mu = FRICTION
@@ -148,11 +180,12 @@ class Newton:
             self._bound(model)
         return model
 
-    def _bending(self, edges: np.ndarray, vbd: bool) -> np.ndarray:
+    def _bending(self, edges: np.ndarray) -> np.ndarray:
         """(E, 2) stiffness and damping of Newton's ``edges`` (E, 4): two opposite vertices, then the edge's."""
         cloth = self.setting.cloth
-        stiffness = hinge_stiffness(cloth)
-        stiffness = stiffness / (cloth.hinge_rest_length if vbd else cloth.hinge_area).double().numpy()
+        length, area = cloth.hinge_rest_length.double().numpy(), cloth.hinge_area.double().numpy()
+        unit = {"vbd": length, "xpbd": area, "style3d": 3.0 * length**2 / area}[self.effort.solver]
+        stiffness = hinge_stiffness(cloth) / unit
         known = {frozenset(pair): float(k) for pair, k in zip(cloth.hinges[:, :2].tolist(), stiffness, strict=True)}
         return np.array([[known.get(frozenset(row[2:]), 0.0), 0.0] for row in edges.tolist()], dtype=np.float32)
 
@@ -233,50 +266,3 @@ class Newton:
         """The cloth at this frame."""
         state = self._states[0]
         return Moment(state.particle_q.numpy().astype(np.float64), state.particle_qd.numpy().astype(np.float64))
-
-
-class NeoHookean:
-    """Energy [J] of VBD's membrane, the sum over faces of A (½ μ (tr FᵀF - 2) + ½ L (J - 1 - μ / L)²) with J the ratio of areas
-    and L = λ + μ, as Newton 1.8 has it (after Smith et al., "Stable Neo-Hookean flesh simulation", 2018), less its value at
-    rest. μ and λ are those of :func:`peer_scenes.membrane`."""
-
-    def applies(self, problem: StepProblem) -> bool:
-        return True
-
-    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
-        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
-        cloth = problem.cloth
-        mu, lam = cloth.thickness * cloth.lame_mu, cloth.thickness * cloth.lame_lambda
-        g00, g01, g11 = green_strain(next_pos, cloth.faces, cloth.rest_inverse)
-        c00, c01, c11 = 2.0 * g00 + 1.0, 2.0 * g01, 2.0 * g11 + 1.0
-        ratio = (c00 * c11 - c01 * c01).clamp_min(1e-20).sqrt()
-        stiff = lam + mu
-        density = 0.5 * mu * (c00 + c11 - 2.0) + 0.5 * stiff * ((ratio - 1.0 - mu / stiff) ** 2 - (mu / stiff) ** 2)
-        return sum_per_scene(cloth.rest_area * density, cloth.face_scene, cloth.num_scenes)
-
-
-def own_gamma(potential: Potential, problem: StepProblem, origin: np.ndarray, next_pos: np.ndarray) -> float:
-    """γ of ``next_pos`` (V, 3) for a ``potential`` of any terms, above the minimum that L-BFGS finds from there.
-
-    hood's solver is not asked: its matrices are of its own energies. Without contact only, which is searched for by hood.
-    """
-    cloth, start = problem.cloth, next_pos - origin
-    free = (~cloth.pinned).numpy()
-    # Light vertices go farther for the same energy.
-    size = (cloth.mass.mean() / cloth.mass).sqrt().numpy()[free, None]
-
-    def at(moved: np.ndarray) -> Tensor:
-        pos = start.copy()
-        pos[free] += size * moved.reshape(-1, 3)
-        return torch.as_tensor(pos)
-
-    def value(moved: np.ndarray) -> tuple[float, np.ndarray]:
-        gradient, energies = potential.gradient(problem, at(moved))
-        return float(sum(energies.values())) / e0, (size * gradient.numpy()[free]).reshape(-1) / e0
-
-    e0 = float(scale(problem))
-    zero = np.zeros(3 * int(free.sum()))
-    found = optimize.minimize(
-        value, zero, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "maxfun": 4000, "ftol": 1e-13}
-    )
-    return value(zero)[0] - float(found.fun)

@@ -20,8 +20,9 @@ from hood.cloth.state import State, StepInput
 from hood.energies.bending import Bending, bending_weight
 from hood.energies.mass_points import Gravity
 from hood.energies.membrane import Stretching
-from hood.energies.potential import Potential
+from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
+from hood.energies.self_contact import LayerBarrier, LayerFriction, has_layers
 from hood.evaluation.gap import gap
 from hood.rollouts.equilibrium import find_equilibrium
 from hood.rollouts.loop import rest_state
@@ -37,8 +38,10 @@ FPS = 30.0
 FABRIC = Material()
 #: Coefficient of friction, speed [m/s] below which it counts as static, distance [m] from the skin where contact sets in.
 FRICTION, SLIP_SPEED, CONTACT_RADIUS = 0.5, 5e-3, 2e-3
+#: Distance [m] between layers of cloth where their contact sets in.
+LAYER_REACH = 3e-3
 #: Side [m] of the sheet, and vertices along it, by the name of its scene.
-SIDE, SHEETS = 1.0, {"drape_1k": 32, "drape_4k": 64}
+SIDE, SHEETS = 1.0, {"drape_1k": 32, "drape_4k": 64, "curtain_1k": 32}
 SCENES = (*SHEETS, "body")
 GRAVITY = 9.81
 _NO_STEP = StepInput(torch.tensor([1.0 / FPS], dtype=torch.float64))
@@ -77,6 +80,7 @@ class Setting:
         scene: in float64; nothing in it settles the cloth again.
         start: positions and velocities of frame 0.
         num_frames: with frame 0.
+        self_contact: cloth is kept off cloth.
     """
 
     name: str
@@ -84,6 +88,7 @@ class Setting:
     start: Moment
     num_frames: int
     fabric: Material = FABRIC
+    self_contact: bool = False
 
     @property
     def cloth(self) -> Cloth:
@@ -112,12 +117,14 @@ class Setting:
 GARMENT, MOTION = "dress", "walk_proud"
 
 
-#: Waves of a sheet that hangs, along its upper edge, and the share of its width that its corners are apart.
-WAVES, WIDTH = 3.5, 0.8
+#: Waves of a sheet that hangs, along its upper edge, and the share of its width that its corners are apart, less of the
+#: curtain, which falls on itself.
+WAVES, WIDTH, CURTAIN = 3.5, 0.8, 0.25
 
 
-def sheet(side: int) -> Garment:
-    """A square of ``side`` × ``side`` vertices that hangs in waves, held at its two upper corners; flat at rest.
+def sheet(side: int, width: float = WIDTH) -> Garment:
+    """A square of ``side`` × ``side`` vertices that hangs in waves, held at its two upper corners, which are ``width`` of its
+    side apart; flat at rest.
 
     The waves are as long as the cloth is: where it starts nothing is stretched, to the second order of an edge.
     """
@@ -128,7 +135,7 @@ def sheet(side: int) -> Garment:
     slope = 2.0 * math.pi * WAVES * np.cos(2.0 * math.pi * WAVES * share)
 
     def length(height: float) -> np.ndarray:
-        speed = np.sqrt(WIDTH**2 + (height * slope) ** 2)
+        speed = np.sqrt(width**2 + (height * slope) ** 2)
         return np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(share))])
 
     low, high = 0.0, 1.0
@@ -137,12 +144,20 @@ def sheet(side: int) -> Garment:
         low, high = (height, high) if length(height)[-1] < 1.0 else (low, height)
     along = np.interp(flat[:, 0] / SIDE, length(low), share)
     waves = low * np.sin(2.0 * math.pi * WAVES * along)
-    hung = SIDE * np.stack([WIDTH * along, -flat[:, 2] / SIDE, waves], axis=1)
+    hung = SIDE * np.stack([width * along, -flat[:, 2] / SIDE, waves], axis=1)
     return Garment(f"sheet {side} × {side}", flat, faces, pinned, skin_pos=hung)
 
 
+def make_potential(self_contact: bool) -> Potential:
+    """What hood minimises: the default, with contact and friction between layers of cloth where they are asked for."""
+    potential = default_potential()
+    if not self_contact:
+        return potential
+    return potential.with_terms(layers=LayerBarrier(LAYER_REACH), layer_friction=LayerFriction(FRICTION, SLIP_SPEED))
+
+
 def make_setting(name: str, num_frames: int, potential: Potential, stretch: float = 1.0) -> Setting:
-    """The scene of a name in :data:`SCENES`.
+    """The scene of a name in :data:`SCENES`; cloth is kept off cloth where ``potential`` does so.
 
     A sheet starts at rest; the dress starts settled on the still body by hood's solver for ``potential``, with the
     velocity of the skinned garment. The fabric is ``stretch`` times as hard to stretch as the default one.
@@ -158,13 +173,16 @@ def make_setting(name: str, num_frames: int, potential: Potential, stretch: floa
     else:
         state, _ = rest_state(NewtonStepper(potential), scene, potential, 0)
         start = Moment(state.pos.numpy() + state.origin[0].numpy(), state.vel.numpy())
-    return Setting(name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames, fabric)
+    return Setting(
+        name, replace(scene, start_pos=start.pos, start_vel=start.vel), start, num_frames, fabric, has_layers(potential)
+    )
 
 
 def _scene_of(name: str, num_frames: int, fabric: Material, dtype: torch.dtype, substeps: int = 1) -> Scene:
     fps = FPS * substeps
     if name in SHEETS:
-        return dress(sheet(SHEETS[name]), NoBody((num_frames - 1) * substeps + 1, fps, dtype), fabric)
+        width = CURTAIN if name.startswith("curtain") else WIDTH
+        return dress(sheet(SHEETS[name], width), NoBody((num_frames - 1) * substeps + 1, fps, dtype), fabric)
     if name != "body":
         raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
     return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, fps), fabric, dtype=dtype)
@@ -231,6 +249,7 @@ class Row:
     strain: float  # 99th percentile of the edge strain, mean over the frames
     cut: float  # share of triangles cut by the skin, mean over the measured frames
     depth: float  # m, greatest height of skin above the cloth
+    crossed: float  # pairs of triangles of cloth that pass through each other, most of the measured frames
     gamma: float  # median over the measured frames, of hood's potential; NaN where none was measured
     energy: float  # J above the static minimum at the end; NaN with a body
     kinetic: float  # J at the end
@@ -250,7 +269,7 @@ class Measures:
         self._meter = SurfaceMeter(setting.scene.garment, setting.scene.motion.faces)
         self._times: list[float] = []
         self._strain: list[float] = []
-        self._cut: list[tuple[float, float]] = []
+        self._cut: list[tuple[float, float, float]] = []
         self._gamma: list[float] = []
         self._last = setting.start
 
@@ -260,7 +279,7 @@ class Measures:
         self._strain.append(strain_metrics(self.setting.cloth, torch.as_tensor(moment.pos))["strain_p99"])
         if frame in self._frames:
             found = self._meter(moment.pos, self.setting.body[frame])
-            self._cut.append((found["cut_face_share"], found["skin_depth"]))
+            self._cut.append((found["cut_face_share"], found["skin_depth"], found["self_crossings"]))
             self._gamma.append(gamma(self.setting, self.potential, frame - 1, self._last, moment.pos))
         self._last = moment
 
@@ -273,6 +292,7 @@ class Measures:
             float(np.mean(self._strain)),
             float(cut[:, 0].mean()),
             float(cut[:, 1].max()),
+            float(cut[:, 2].max()),
             float(np.median(self._gamma)),
             resting_energy(cloth, self._last.pos) - minimum,
             0.5 * float((cloth.mass.numpy() * (self._last.vel**2).sum(axis=1)).sum()),
@@ -313,8 +333,11 @@ def resting_energy(cloth: Cloth, pos: np.ndarray) -> float:
 
 def static_minimum(setting: Setting, potential: Potential, pos: np.ndarray) -> float:
     """[J] of :func:`resting_energy` where a sheet that is at ``pos`` (V, 3) comes to rest; NaN with a body."""
-    if setting.name not in SHEETS:
-        return math.nan
+    return resting_energy(setting.cloth, at_rest(setting, potential, pos)) if setting.name in SHEETS else math.nan
+
+
+def at_rest(setting: Setting, potential: Potential, pos: np.ndarray) -> np.ndarray:
+    """(V, 3) m where a sheet that is at ``pos`` (V, 3) comes to rest under ``potential``."""
     state = State(torch.as_tensor(pos), torch.zeros_like(torch.as_tensor(pos)), torch.zeros(1, 3, dtype=torch.float64))
     rest = find_equilibrium(setting.scene, potential, state, 0, torch.tensor([0.0, -GRAVITY, 0.0], dtype=torch.float64))
-    return resting_energy(setting.cloth, rest.pos.numpy())
+    return np.asarray(rest.pos.numpy())

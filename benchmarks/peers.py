@@ -5,24 +5,28 @@
     python benchmarks/peers.py body --frames 60 --picture outputs/peers.png  # the dress on the embedded body, walk_proud
     python benchmarks/peers.py drape_1k --stretch 10                         # a fabric ten times as hard to stretch
     python benchmarks/peers.py drape_1k --one-step                           # the error of one frame, under two energies
+    python benchmarks/peers.py curtain_1k --self-contact                     # cloth is kept off cloth, where a program can
 
-The others are no part of hood: NVIDIA Newton (``pip install newton==1.8.0 warp-lang==1.19.0``), of which ``vbd:SxI`` and
-``xpbd:SxI`` are its solvers VBD and XPBD with S substeps a frame of I iterations each, and MuJoCo (``pip install
-mujoco==4.0.0``) with S steps a frame, ``mujoco-discrete:S`` and ``mujoco-Euler:S``. By ``vbd:SxI:R`` contact sets in at R mm
-instead of 2, by ``vbd-surface:SxI`` edges and faces touch the body as well. hood's are ``newton`` (its solver, as
+The others are no part of hood: NVIDIA Newton (``pip install newton==1.8.0 warp-lang==1.19.0``), of which ``vbd:SxI``,
+``xpbd:SxI`` and ``style3d:SxI`` are its solvers VBD, XPBD and Style3D with S substeps a frame of I iterations each (in
+``style3d:SxIxL`` of L linear ones instead of 10), and MuJoCo (``pip install mujoco==4.0.0``) with S steps a frame,
+``mujoco-discrete:S`` and ``mujoco-Euler:S``. By ``vbd:SxI:R`` contact sets in at R mm instead of 2, by ``vbd-surface:SxI``
+edges and faces touch the body as well. hood's are ``newton`` (its solver, as
 ``stepper=newton``), ``newton:S`` (the same with S steps a frame), weights, ``weights+K`` refined by K iterations, and
-``guess+K`` (as ``stepper=refine``). How the fabric is said in the terms of the others is in ``peer_newton.py`` and
-``peer_mujoco.py``.
+``guess+K`` (as ``stepper=refine``). How the fabric is said in the terms of the others is in ``peer_newton.py``,
+``peer_style3d.py`` and ``peer_mujoco.py``.
 
 All methods start from the same positions and velocities and go frame by frame in turns: a busy machine slows all of them. A row
 a method: median CPU milliseconds of a frame; mean 99th percentile of the edge strain; of the frames that --stride says the mean
-share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth and the median γ; and of a sheet
+share of the cloth's triangles that the skin cuts, the greatest height of skin above the cloth, the most pairs of triangles of
+cloth that pass through each other, and the median γ; and of a sheet
 at the end the energy of stretching, bending and gravity above the minimum at rest, and the kinetic energy. γ is the energy that
 a frame leaves above the exact implicit step of hood's potential, from the method's own state: whoever divides a frame into
 substeps follows another path through it, and γ is large for that alone.
 
 ``--one-step`` gives every method the same states, of hood's solver, and lets it take one frame: γ of hood's potential, and of
-VBD's first substep as well that of its own energy, above the minimum that L-BFGS finds of it. For a sheet.
+VBD's and Style3D's first substep as well that of their own energy, above the minimum that L-BFGS finds of it. For a sheet.
+``--rest``: where a sheet comes to rest by the energies of hood, VBD and Style3D, above hood's rest by hood's energy.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import peer_laws
 import peer_mujoco
 import peer_newton
 import torch
@@ -48,6 +53,7 @@ from peer_scenes import (
     Setting,
     Simulation,
     gamma,
+    make_potential,
     make_setting,
     problem_at,
     static_minimum,
@@ -55,7 +61,8 @@ from peer_scenes import (
 
 from hood.app.candidates import machine_name
 from hood.assets.files.library import locate
-from hood.energies.potential import Potential, default_potential
+from hood.energies.potential import Potential
+from hood.energies.self_contact import for_networks
 from hood.media.renderer.camera import Camera
 from hood.media.renderer.render import BODY_COLOR, RenderMesh, captioned, render_frame
 from hood.media.video import save_png
@@ -69,10 +76,14 @@ from hood.steppers.refined import GuessStepper, RefinedStepper, prepare_stepper
 from hood.steppers.stopping import Count
 
 VBD = ("vbd:10x5", "vbd:10x10", "vbd:10x20", "vbd:20x10")
+STYLE3D = ("style3d:1x10", "style3d:1x50", "style3d:10x5", "style3d:10x10")
 XPBD = ("xpbd:10x10", "xpbd:20x2", "xpbd:20x10", "xpbd:40x5")
 MUJOCO = ("mujoco-discrete:1", "mujoco-discrete:10", "mujoco-Euler:40")
 HOOD = ("newton", "newton:10", "guess+5", "quickstart", "quickstart+5")
-HEADER = f"{'':22}{'ms':>9}{'strain p99':>12}{'cut':>8}{'skin, mm':>10}{'gamma':>10}{'above rest, mJ':>16}{'kinetic, mJ':>13}"
+HEADER = (
+    f"{'':22}{'ms':>9}{'strain p99':>12}{'cut':>8}{'skin, mm':>10}{'crossed':>9}{'gamma':>10}{'above rest, mJ':>16}"
+    f"{'kinetic, mJ':>13}"
+)
 #: A cloth whose edges are longer by so many times their length has come apart.
 DIVERGED = 3.0
 #: Frames whose states single steps are taken from.
@@ -112,7 +123,7 @@ def make_stepper(name: str, potential: Potential) -> tuple[Stepper, torch.dtype]
         return RefinedStepper(GuessStepper(potential), potential, Count(int(count or 1))), torch.float64
     simulator = load_simulator(locate("weights", base)).eval()
     simulator.network.use_kernels(choose_kernels("fp32", simulator.network.latent_dim, torch.device("cpu")).kernels)
-    simulator.use_potential(potential)
+    simulator.use_potential(for_networks(potential))
     return (RefinedStepper(simulator, potential, Count(int(count))), torch.float64) if count else (simulator, torch.float32)
 
 
@@ -124,10 +135,12 @@ def make_method(name: str, setting: Setting, potential: Potential) -> Simulation
         SystemExit: its package is not installed.
     """
     kind, _, effort = name.partition(":")
-    if kind in ("vbd", "vbd-surface", "xpbd"):
+    if kind in ("vbd", "vbd-surface", "xpbd", "style3d"):
         counts, _, radius = effort.partition(":")
-        substeps, iterations = map(int, counts.split("x"))
-        chosen = peer_newton.Effort(kind.removesuffix("-surface"), substeps, iterations, surface=kind == "vbd-surface")
+        substeps, iterations, *linear = map(int, counts.split("x"))
+        solver, surface = kind.removesuffix("-surface"), kind == "vbd-surface"
+        chosen = peer_newton.Effort(solver, substeps, iterations, surface=surface, self_contact=setting.self_contact)
+        chosen = replace(chosen, linear=linear[0]) if linear else chosen
         return peer_newton.Newton(setting, replace(chosen, radius=1e-3 * float(radius)) if radius else chosen)
     if kind.startswith("mujoco-"):
         return peer_mujoco.MuJoCo(setting, peer_mujoco.Effort(kind.removeprefix("mujoco-"), int(effort)))
@@ -145,6 +158,7 @@ def line(row: Row) -> str:
 
     return (
         f"{row.name:22}{row.ms:>9.1f}{row.strain:>12.3f}{known(row.cut, '.2%'):>8}{known(1e3 * row.depth, '.1f'):>10}"
+        f"{known(row.crossed, '.0f'):>9}"
         f"{known(row.gamma, '.3g'):>10}{known(1e3 * row.energy, '.2f'):>16}{1e3 * row.kinetic:>13.2f}"
     )
 
@@ -195,7 +209,7 @@ def one_steps(setting: Setting, names: Sequence[str], potential: Potential) -> N
     for frame in range(1, max(STEPS_FROM) + 1):
         steady.step()
         states[frame] = steady.now()
-    own = potential.with_terms(stretching=peer_newton.NeoHookean())
+    own = peer_laws.own_potentials(setting, potential)
     print(f"{'':22}{'ms':>9}{'gamma':>10}{'gamma, own':>12}")
     for name in names:
         take = _taking(name, setting, potential)
@@ -205,21 +219,21 @@ def one_steps(setting: Setting, names: Sequence[str], potential: Potential) -> N
             ms, pos = take(frame, states[frame])
             times.append(ms)
             ours.append(gamma(setting, potential, frame, states[frame], pos))
-            if name.startswith("vbd"):
-                theirs.append(_own_gamma(own, name, setting, potential, frame, states[frame]))
+            if (kind := name.partition(":")[0]) in own:
+                theirs.append(_own_gamma(own[kind], name, setting, potential, frame, states[frame]))
         shown = f"{np.median(theirs):.3g}" if theirs else "-"
         print(f"{name:22}{np.median(times):>9.1f}{np.median(ours):>10.3g}{shown:>12}", flush=True)
 
 
 def _own_gamma(own: Potential, name: str, setting: Setting, potential: Potential, frame: int, moment: Moment) -> float:
-    """γ of VBD's first substep from a state, of its own energy."""
+    """γ of Newton's first substep from a state, of the solver's own energy."""
     method = make_method(name, setting, potential)
     assert isinstance(method, peer_newton.Newton)
     method.put(moment, frame)
     method.substep()
     problem, origin = problem_at(setting, frame, moment)
     dt = problem.step.dt / method.effort.substeps
-    return peer_newton.own_gamma(own, replace(problem, step=replace(problem.step, dt=dt)), origin, method.now().pos)
+    return peer_laws.own_gamma(own, replace(problem, step=replace(problem.step, dt=dt)), origin, method.now().pos)
 
 
 def _taking(name: str, setting: Setting, potential: Potential) -> Callable[[int, Moment], tuple[float, np.ndarray]]:
@@ -247,17 +261,24 @@ def _taking(name: str, setting: Setting, potential: Potential) -> Callable[[int,
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", choices=SCENES)
-    parser.add_argument("--methods", nargs="+", default=(*HOOD, *VBD, *XPBD, *MUJOCO), help="see above")
+    parser.add_argument("--methods", nargs="+", default=(*HOOD, *VBD, *STYLE3D, *XPBD, *MUJOCO), help="see above")
     parser.add_argument("--frames", type=int, default=31, help="with frame 0")
     parser.add_argument("--stride", type=int, default=10, help="of the frames whose surface and gamma are measured")
     parser.add_argument("--stretch", type=float, default=1.0, help="how many times as hard to stretch the fabric is")
     parser.add_argument("--picture", type=Path, default=None, help="a PNG of the last frame of all methods")
     parser.add_argument("--one-step", action="store_true", help="single steps from the same states instead")
+    parser.add_argument(
+        "--rest", action="store_true", help="where a sheet rests by the energies of hood, VBD and Style3D instead"
+    )
+    parser.add_argument("--self-contact", action="store_true", help="cloth is kept off cloth")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    potential = default_potential()
+    potential = make_potential(chosen.self_contact)
     setting = make_setting(chosen.scene, chosen.frames, potential, chosen.stretch)
     print(f"{chosen.scene}: {setting.cloth.num_vertices} vertices, {chosen.frames} frames, {machine_name('cpu')}", flush=True)
+    if chosen.rest:
+        peer_laws.rests(setting, potential)
+        return
     if chosen.one_step:
         one_steps(setting, chosen.methods, potential)
         return

@@ -43,6 +43,11 @@ def newton(peers):
     return sys.modules["peer_newton"]
 
 
+@pytest.fixture(scope="module")
+def laws(peers):
+    return sys.modules["peer_laws"]
+
+
 @pytest.mark.parametrize("side", [12, 32])
 def test_a_sheet_hangs_unstretched_from_two_corners(scenes, side):
     sheet = scenes.sheet(side)
@@ -63,7 +68,7 @@ def test_a_setting_starts_every_method_from_the_same_place(peers, scenes):
     for start in starts:
         assert np.abs(start.pos - setting.start.pos).max() < 1e-12
     assert setting.body.shape == (3, 0, 3)
-    with pytest.raises(ValueError, match="'tent': choose of drape_1k, drape_4k, body"):
+    with pytest.raises(ValueError, match="'tent': choose of drape_1k, drape_4k, curtain_1k, body"):
         scenes.make_setting("tent", 3, default_potential())
 
 
@@ -107,13 +112,13 @@ def test_hinges_are_as_stiff_as_the_energy_says(scenes):
     assert energy == pytest.approx(0.5 * scenes.hinge_stiffness(cloth)[0] * angle**2)
 
 
-def test_the_membrane_of_vbd_is_hoods_in_small_strain_and_another_beyond(newton, scenes):
+def test_the_membrane_of_vbd_is_hoods_in_small_strain_and_another_beyond(laws, scenes):
     cloth = build_cloth(*grid(4, 3), scenes.FABRIC, dtype=torch.float64)
     problem, drawn = make_problem(cloth), np.random.default_rng(0).normal(size=(12, 3)) * [1.0, 0.0, 1.0]
 
     def energies(size: float) -> tuple[float, float]:
         pos = cloth.rest_pos + size * torch.as_tensor(drawn)
-        return tuple(float(term(problem, pos, torch.zeros_like(pos))) for term in (Stretching(), newton.NeoHookean()))
+        return tuple(float(term(problem, pos, torch.zeros_like(pos))) for term in (Stretching(), laws.NeoHookean()))
 
     ours, theirs = energies(1e-6)
     assert theirs == pytest.approx(ours, rel=1e-3)
@@ -121,17 +126,92 @@ def test_the_membrane_of_vbd_is_hoods_in_small_strain_and_another_beyond(newton,
     assert abs(theirs / ours - 1.0) > 1e-2
 
 
-def test_the_membrane_of_vbd_is_an_energy_of_shape(newton):
-    term = newton.NeoHookean()
+def test_the_membrane_of_vbd_is_an_energy_of_shape(laws):
+    term = laws.NeoHookean()
     cloth = build_cloth(*grid(4, 3), Material(), dtype=torch.float64)
     pos = cloth.rest_pos + 0.02 * torch.randn(12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     gradient, _ = Potential({"term": term}).gradient(make_problem(cloth), pos)
     assert float(gradient.sum(dim=0).abs().max()) < 1e-12 * float(gradient.abs().sum())
 
 
+def _gradient(term, cloth, pos):
+    gradient, _ = Potential({"term": term}).gradient(make_problem(cloth), pos)
+    return gradient
+
+
+def test_the_membrane_of_style3d_is_hoods_in_shear_and_in_a_free_strip(laws, scenes):
+    strain, law = 1e-5, scenes.membrane(scenes.FABRIC)
+    pos, faces = grid(4, 4, 1.0)
+    cloth = build_cloth(pos, faces, scenes.FABRIC, dtype=torch.float64)
+    term, here = laws.BaraffWitkin(cloth, law), torch.as_tensor(pos)
+    sheared = here.clone()
+    sheared[:, 0] += strain * here[:, 2]
+    ours, theirs = _gradient(Stretching(), cloth, sheared), _gradient(term, cloth, sheared)
+    assert float((theirs - ours).abs().max()) < 1e-3 * float(ours.abs().max())
+    for axis in (0, 2):
+        pulled = here.clone()
+        pulled[:, axis] *= 1.0 + strain
+        end = here[:, axis] == here[:, axis].max()
+        force = _gradient(term, cloth, pulled)
+        assert float(force[end, axis].sum()) == pytest.approx(law.young * strain, rel=1e-3)
+        assert float(force[:, 2 - axis].abs().max()) < 1e-3 * law.young * strain
+
+
+def test_the_bending_of_style3d_is_hoods_where_hinges_are_hardly_folded(laws, scenes):
+    cloth = build_cloth(*grid(5, 4), scenes.FABRIC, dtype=torch.float64)
+    pos = cloth.rest_pos.clone()
+    pos[:, 1] += 1e-6 * torch.as_tensor(np.random.default_rng(0).normal(size=len(pos)))
+    ours, theirs = _gradient(Bending(), cloth, pos), _gradient(laws.FlatBending(cloth), cloth, pos)
+    assert float((theirs - ours)[:, 1].abs().max()) < 1e-3 * float(ours.abs().max())
+
+
+def test_the_panels_of_style3d_are_the_faces_at_rest(peers):
+    rest = np.random.default_rng(0).normal(size=(9, 3))
+    faces = np.arange(9).reshape(3, 3)
+    flat = sys.modules["peer_style3d"].panels(rest, faces)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        lengths = np.linalg.norm(rest[faces[:, a]] - rest[faces[:, b]], axis=1)
+        assert np.linalg.norm(flat[:, a] - flat[:, b], axis=1) == pytest.approx(lengths)
+    assert (np.linalg.det(flat[:, 1:] - flat[:, :1]) > 0).all()
+
+
+def test_newton_takes_the_fabric_as_it_is_said_to_style3d(newton, laws, scenes):
+    """The forces of its kernels on a crumpled sheet; those of its shear to the first order in strain."""
+    pytest.importorskip("newton")
+    import warp
+    from newton._src.solvers.style3d import kernels
+
+    setting = scenes.make_setting("drape_1k", 2, default_potential())
+    cloth, law = setting.cloth, scenes.membrane(setting.fabric)
+    model = newton.Newton(setting, newton.Effort("style3d", 1, 1)).model
+    step = torch.randn(cloth.rest_pos.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    pos = torch.as_tensor(setting.start.pos) + 1e-4 * step
+    there = warp.array(pos.numpy().astype(np.float32), dtype=warp.vec3, device="cpu")
+    style = model.style3d
+    stretch = (there, model.tri_areas, model.tri_poses, model.tri_indices, style.tri_aniso_ke)
+    bend = (there, style.edge_rest_area, style.edge_bending_cot, model.edge_indices, model.edge_bending_properties)
+    terms = (laws.BaraffWitkin(cloth, law), laws.FlatBending(cloth))
+    for kernel, arguments, term in zip(
+        (kernels.eval_stretch_kernel, kernels.eval_bend_kernel), (stretch, bend), terms, strict=True
+    ):
+        forces = warp.zeros(len(pos), dtype=warp.vec3, device="cpu")
+        warp.launch(kernel, dim=len(arguments[1]), inputs=list(arguments), outputs=[forces], device="cpu")
+        ours = -_gradient(term, cloth, pos).numpy()
+        assert np.abs(forces.numpy() - ours).max() < 1e-2 * np.abs(ours).max()
+
+
+def test_layers_are_kept_apart_where_they_are_asked_for(peers, scenes, newton):
+    potential = scenes.make_potential(self_contact=True)
+    setting = scenes.make_setting("drape_1k", 2, potential)
+    assert setting.self_contact
+    assert not scenes.make_setting("drape_1k", 2, scenes.make_potential(self_contact=False)).self_contact
+    with pytest.raises(scenes.CannotDoError, match="keeps particles apart"):
+        peers.make_method("xpbd:1x1", setting, potential)
+
+
 def test_a_row_says_what_was_measured(peers, scenes):
-    row = scenes.Row("newton", 12.34, 0.0567, 0.0123, 4.2e-3, 0.5, float("nan"), 1.5e-3)
-    assert peers.line(row).split() == ["newton", "12.3", "0.057", "1.23%", "4.2", "0.5", "-", "1.50"]
+    row = scenes.Row("newton", 12.34, 0.0567, 0.0123, 4.2e-3, 2.0, 0.5, float("nan"), 1.5e-3)
+    assert peers.line(row).split() == ["newton", "12.3", "0.057", "1.23%", "4.2", "2", "0.5", "-", "1.50"]
     assert len(peers.line(row)) == len(peers.HEADER)
 
 
