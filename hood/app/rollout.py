@@ -13,8 +13,17 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
-from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
+from hood.app.batch.batch import (
+    Job,
+    as_begun,
+    find_jobs,
+    motion_attributes,
+    refuse_others,
+    resumed,
+    share,
+    with_one_stepper,
+    write_overview,
+)
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier

@@ -47,7 +47,7 @@ COMMANDS = {
 #: Where each of them lives; the others, and those of installed packages, are registered (:mod:`hood.plugins`).
 _HOMES = {
     "rollout": "hood.cli.rollout:run",
-    "dress": "hood.cli.rollout:dress",
+    "dress": "hood.cli.rollout:dressed",
     "view": "hood.cli.compare:view",
     "compare": "hood.cli.compare:run",
     "export": "hood.cli.export:run",
@@ -210,9 +210,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
     if arguments and arguments[0] in _SIMULATE and not any(word in ("-h", "--help") for word in arguments):
-        from hood.native import libraries
-
-        libraries.start()
+        build.start()
     try:
         code = main(arguments)
         sys.stdout.flush()

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from hood.app.batch.dress import dress as dressed
+from hood.app.batch.dress import dress_rows
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
@@ -42,10 +42,10 @@ def code_of(done: Rollouts) -> int:
     return code
 
 
-def dress(overrides: Sequence[str]) -> int:
+def dressed(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where more rows failed than
     ``fail_fraction`` says, else 3 where more are unsound, else 0."""
-    return dressed(overrides).code
+    return dress_rows(overrides).code
 
 
 def train(overrides: Sequence[str]) -> int:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.app.batch.engines import LOCAL, TORCHRUN, check_engine, is_first, run, usual_workers
+from hood.app.batch.engines import LOCAL, TORCHRUN, check_engine, run_engine, tells_user, usual_workers
 from hood.app.batch.manifest import (
     DOUBTFUL,
     FAILED,
@@ -25,13 +25,13 @@ from hood.app.batch.manifest import (
     VERDICTS,
     Line,
     Manifest,
-    mend,
+    mend_manifest,
     open_rows,
     read_manifest,
     require_same_rows,
 )
-from hood.app.batch.rows import Row, rows_of
-from hood.app.batch.work import Task, cause_of, clear, silently
+from hood.app.batch.rows import AXES, DataRow, rows_of
+from hood.app.batch.work import Call, cause_of, clear, silently
 from hood.app.common import output_folder, prepare_folder
 from hood.app.output.export import check_outputs
 from hood.app.output.verdict import FAIL_ON_DOUBTS, FAIL_ON_NOTHING
@@ -78,7 +78,7 @@ class Dressed:
     code: int
 
 
-def dress(overrides: Sequence[str]) -> Dressed:
+def dress_rows(overrides: Sequence[str]) -> Dressed:
     """Run what the words of ``hood dress`` ask for; the rest of its words are those of a rollout.
 
     Raises:
@@ -87,19 +87,21 @@ def dress(overrides: Sequence[str]) -> Dressed:
     """
     config, given, words = _split(overrides)
     _check(config)
-    common = _common(words, int(config.seed))
+    common, why = _common(words, int(config.seed))
     rows, start = rows_of(config, given)
     record = common.with_values(root=start or None, seed=int(config.seed))
     folder = output_folder(config)
     known = _earlier(folder, record, rows)
+    for sentence in why if tells_user() else ():
+        say(sentence)
     if bool(config.dry_run):
         _tell_plan(config, words, rows, sum(row.name in known for row in rows))
         return Dressed(known, len(rows), False, 0)
     with ExitStack() as stack:
-        if is_first():
+        if tells_user():
             stack.enter_context(occupy(prepare_folder(folder)))
             clear(folder)
-            mended = mend(folder, rows)
+            mended = mend_manifest(folder, rows)
             if mended:
                 say(f"{mended} rows were whole and had no line in manifest.jsonl; they have one now")
             if not (folder / "config.yaml").exists():
@@ -109,22 +111,22 @@ def dress(overrides: Sequence[str]) -> Dressed:
         return _work(config, words, rows, folder, str(common.fail_on))
 
 
-def _work(config: DictConfig, words: Sequence[str], rows: Sequence[Row], folder: Path, fail_on: str) -> Dressed:
+def _work(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow], folder: Path, fail_on: str) -> Dressed:
     left, said = open_rows(folder, rows, read_manifest(folder), str(config.retry))
-    for sentence in said if is_first() else ():
+    for sentence in said if tells_user() else ():
         say(sentence)
-    task = Task(folder, tuple(words), int(config.attempts), Manifest(folder).size())
-    progress, interrupted = _Progress(folder, task.since, len(rows), len(left)), False
-    if is_first() and len(left) < len(rows):
+    call = Call(folder, tuple(words), int(config.attempts), Manifest(folder).size())
+    progress, interrupted = _Progress(folder, call.since, len(rows), len(left)), False
+    if tells_user() and len(left) < len(rows):
         say(f"{len(rows) - len(left)} of {len(rows)} rows were done before")
     try:
         if left:
-            run(config, task, left, progress.follow if is_first() else lambda: None)
+            run_engine(config, call, left, progress.follow if tells_user() else lambda: None)
     except KeyboardInterrupt:
         interrupted = True
     names = {row.name for row in rows}
     lines = {name: line for name, line in read_manifest(folder).items() if name in names}
-    if not is_first():
+    if not tells_user():
         return Dressed(lines, len(rows), interrupted, 130 if interrupted else 0)
     clear(folder)
     code = 130 if interrupted else _conclude(config, lines, len(rows), folder, fail_on)
@@ -143,6 +145,8 @@ def _split(overrides: Sequence[str]) -> tuple[DictConfig, list[str], list[str]]:
             raise ConfigError(f"{word}: hood dress goes on by itself where the same command stopped; leave it out")
         if "=" in word and key.split(".")[0] not in (*own, *theirs):
             raise ConfigError(unknown("key", key, [*own, *theirs]))
+        if key in AXES and "=" in word and not word.partition("=")[2].startswith("["):
+            word = f"{key}=[{word.partition('=')[2]}]"
         (mine if key in own or "=" not in word or word.startswith("-") else words).append(word)
     return load_config("dress", mine), [word.partition("=")[0] for word in mine], list(named_today([*_USUAL, *words]))
 
@@ -159,8 +163,8 @@ def _check(config: DictConfig) -> None:
     check_engine(config)
 
 
-def _common(words: list[str], seed: int) -> RolloutSettings:
-    """The settings that all rows have; the stepper is named among ``words`` afterwards."""
+def _common(words: list[str], seed: int) -> tuple[RolloutSettings, list[str]]:
+    """The settings that all rows have, and why these; the stepper is named among ``words`` afterwards."""
     config = RolloutSettings.from_words([*words, f"seed={seed}"])
     check_config(config)
     check_outputs(config)
@@ -169,14 +173,12 @@ def _common(words: list[str], seed: int) -> RolloutSettings:
     settled, why = decided(config)
     if str(settled.stepper) == AUTO:
         raise ConfigError("stepper=auto: measures every scene anew; name a stepper for all rows, stepper=newton or network")
-    for sentence in why if is_first() else ():
-        say(sentence)
     if settled is not config:
         words.append(f"stepper={settled.stepper}")
-    return settled
+    return settled, why
 
 
-def _earlier(folder: Path, record: RolloutSettings, rows: Sequence[Row]) -> dict[str, Line]:
+def _earlier(folder: Path, record: RolloutSettings, rows: Sequence[DataRow]) -> dict[str, Line]:
     """The lines of earlier calls, whose settings are the same.
 
     Raises:
@@ -185,7 +187,8 @@ def _earlier(folder: Path, record: RolloutSettings, rows: Sequence[Row]) -> dict
     known = read_manifest(folder)
     if not known and ((folder / "rollout.h5").exists() or (folder / "summary.json").exists()):
         raise ConfigError(f"output={folder}: holds rollouts of hood rollout; choose another output")
-    require_same_config(record, folder, _FREE)
+    keys = sorted(record, key=lambda key: isinstance(record[key], DictConfig))  # groups take values from keys
+    require_same_config({key: record[key] for key in keys}, folder, _FREE)
     require_same_rows(folder, rows, known)
     return known
 
@@ -279,7 +282,7 @@ class _Cost:
     frame_bytes: float
 
 
-def _tell_plan(config: DictConfig, words: Sequence[str], rows: Sequence[Row], done: int) -> None:
+def _tell_plan(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow], done: int) -> None:
     """Rows, frames, hours and bytes of the whole data set.
 
     Raises:
@@ -315,9 +318,9 @@ def _tell_plan(config: DictConfig, words: Sequence[str], rows: Sequence[Row], do
         say(f"hood: of the {len(chosen)} rows that were tried one failed: {failure}", error=True)
 
 
-def _probed(rows: Sequence[Row]) -> list[Row]:
+def _probed(rows: Sequence[DataRow]) -> list[DataRow]:
     """A row of every scene as far as there are not too many, else spread over all."""
-    scenes = defaultdict[str, list[Row]](list)
+    scenes = defaultdict[str, list[DataRow]](list)
     for row in rows:
         scenes[_scene_of(row)].append(row)
     groups = list(scenes.values())
@@ -327,11 +330,11 @@ def _probed(rows: Sequence[Row]) -> list[Row]:
     return [row for group in groups for row in group[:: max(1, -(-len(group) * len(groups) // _PROBES))]][:_PROBES]
 
 
-def _scene_of(row: Row) -> str:
+def _scene_of(row: DataRow) -> str:
     return row.keys.get("garment", "")
 
 
-def _probe(words: Sequence[str], row: Row, folder: Path) -> _Cost:
+def _probe(words: Sequence[str], row: DataRow, folder: Path) -> _Cost:
     """Simulate a few frames of a row, and more; what these took longer is the frames'."""
     spent, sizes, counts = [], [], []
     for most in _PROBE_FRAMES:
@@ -348,13 +351,13 @@ def _probe(words: Sequence[str], row: Row, folder: Path) -> _Cost:
     return _Cost(max(spent[1] - counts[1] * frame[0], 0.0), frame[0], max(sizes[1] - counts[1] * frame[1], 0.0), frame[1])
 
 
-def _cost_of(row: Row, costs: Mapping[str, list[_Cost]], measured: Sequence[_Cost]) -> _Cost:
+def _cost_of(row: DataRow, costs: Mapping[str, list[_Cost]], measured: Sequence[_Cost]) -> _Cost:
     found = costs.get(_scene_of(row)) or measured
     names = ("row_seconds", "frame_seconds", "row_bytes", "frame_bytes")
     return _Cost(*(float(np.mean([getattr(cost, name) for cost in found])) for name in names))
 
 
-def _frames_of(words: Sequence[str], rows: Sequence[Row]) -> list[float]:
+def _frames_of(words: Sequence[str], rows: Sequence[DataRow]) -> list[float]:
     """Frames of every row, by the headers of its motion; where these do not tell, as many as others have on average."""
     counted = [_count(words, row) for row in rows]
     missing = [row for row, count in zip(rows, counted, strict=True) if count is None]
@@ -370,7 +373,7 @@ def _frames_of(words: Sequence[str], rows: Sequence[Row]) -> list[float]:
     return [usual if count is None else count for count in counted]
 
 
-def _count(words: Sequence[str], row: Row) -> float | None:
+def _count(words: Sequence[str], row: DataRow) -> float | None:
     """Frames of a row by the header of its motion; None where it does not tell."""
     own = tuple(word for word in row.words if word.partition("=")[0] not in ("seed", "sequence"))
     config = _loaded(tuple(words), own)

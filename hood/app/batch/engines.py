@@ -5,11 +5,13 @@ Ray and submitit are packages of their own, imported where they are asked for.
 
 from __future__ import annotations
 
+import _thread
 import importlib
 import importlib.util
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -22,19 +24,20 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hood.app.batch.manifest import Manifest
-from hood.app.batch.rows import Row
-from hood.app.batch.work import HopelessError, Task, is_held, lose, make, pull
+from hood.app.batch.rows import DataRow
+from hood.app.batch.work import Call, HopelessError, is_held, lose, make_row, pull
 from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.assets.files.said import install, say
 
-ENGINES = LOCAL, RAY, SLURM, TORCHRUN = "local", "ray", "slurm", "torchrun"
+_ENGINES = LOCAL, RAY, SLURM, TORCHRUN = "local", "ray", "slurm", "torchrun"
 #: Packages that engines need, and the extra of each.
 _PACKAGES = {RAY: "ray", SLURM: "submitit"}
 #: Seconds between two looks at the manifest.
 _PAUSE = 0.2
 #: Processes that end before they make a row, one after the other, until nothing is expected of further ones.
 _VAIN = 5
-#: Seconds that a job which was sent back by the cluster has to be seen in its queue.
+#: Seconds between two looks whether Ray's cluster is there.
+_SIGN = 3.0
 _REFUSED = "engine=slurm: the cluster refuses the jobs"
 
 #: Is called now and then while others work: reads what they have done, and says it.
@@ -43,7 +46,7 @@ Follow = Callable[[], None]
 
 def check_engine(config: DictConfig) -> None:
     """Raise ConfigError where the keys of an engine cannot be meant, or its package is not installed."""
-    require_choice(config, "engine", ENGINES)
+    require_choice(config, "engine", _ENGINES)
     engine, workers = str(config.engine), config.workers
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
         raise ConfigError(f"workers={shown(workers)}: give a whole number from 1 on, or null")
@@ -71,29 +74,29 @@ def check_engine(config: DictConfig) -> None:
         raise ConfigError(f"job={shown(config.job)}: is a table for engine=slurm, such as job={{timeout_min:600}}")
 
 
-def is_first() -> bool:
+def tells_user() -> bool:
     """Whether this process tells the user how far the work is."""
     return int(os.environ.get("RANK", "0")) == 0
 
 
-def run(config: DictConfig, task: Task, rows: Sequence[Row], follow: Follow) -> None:
+def run_engine(config: DictConfig, call: Call, rows: Sequence[DataRow], follow: Follow) -> None:
     """Make the rows, or those that nobody else makes; ``follow`` is called meanwhile.
 
     Raises:
-        OSError: the disk refuses.
-        ConfigError, RuntimeError: an engine that cannot work.
+        OSError: the disk refuses; an engine that cannot work.
+        ConfigError: an engine that cannot begin.
     """
     engine = str(config.engine)
     workers = usual_workers() if config.workers is None else int(config.workers)
     if engine == LOCAL:
-        Pool(task, rows, min(workers, len(rows))).work(follow)
+        Pool(call, rows, min(workers, len(rows))).work(follow)
     elif engine == TORCHRUN:
         rank, size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-        Pool(task, rows, 1, first=rank * len(rows) // size).work(follow, stay=rank == 0)
+        Pool(call, rows, 1, first=rank * len(rows) // size).work(follow, stay=rank == 0)
     elif engine == RAY:
-        _run_ray(config, task, rows, follow)
+        _run_ray(config, call, rows, follow)
     else:
-        _run_slurm(config, task, rows, min(workers, len(rows)), follow)
+        _run_slurm(config, call, rows, min(workers, len(rows)), follow)
 
 
 def usual_workers() -> int:
@@ -112,18 +115,18 @@ class Pool:
         first: place of the row that the first of them begins with; the others begin in even distances.
     """
 
-    def __init__(self, task: Task, rows: Sequence[Row], workers: int, first: int = 0) -> None:
-        self.task, self.rows, self.left = task, rows, {row.name for row in rows}
+    def __init__(self, call: Call, rows: Sequence[DataRow], workers: int, first: int = 0) -> None:
+        self.call, self.rows, self.left = call, rows, {row.name for row in rows}
         self._firsts = [first + place * len(rows) // workers for place in range(workers)]
         self._running: dict[int, tuple[SpawnProcess, Connection]] = {}
-        self._manifest, self._vain = Manifest(task.folder, task.since), 0
+        self._manifest, self._vain = Manifest(call.folder, call.since), 0
 
     def work(self, follow: Follow, stay: bool = True) -> None:
         """Until all rows are done; without ``stay`` until others hold what is left.
 
         Raises:
             OSError: the disk refuses.
-            RuntimeError: processes end before they make a row.
+            ChildProcessError: processes end before they make a row.
         """
         try:
             while self._look():
@@ -155,7 +158,7 @@ class Pool:
         missing = [place for place in range(len(self._firsts)) if place not in self._running]
         if not missing:
             return
-        free = sum(row.name in self.left and not is_held(self.task.folder, row) for row in self.rows)
+        free = sum(row.name in self.left and not is_held(self.call.folder, row) for row in self.rows)
         for place in missing[:free]:
             self._running[place] = self._start(self._firsts[place])
 
@@ -165,7 +168,7 @@ class Pool:
         before = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is loaded
         try:
-            process = context.Process(target=_worker, args=(self.task, self.rows, first, there), daemon=True)
+            process = context.Process(target=_worker, args=(self.call, self.rows, first, there), daemon=True)
             process.start()
         finally:
             os.environ.pop("OMP_NUM_THREADS")
@@ -188,18 +191,18 @@ class Pool:
                 raise error
             if process.exitcode:
                 self._vain += 1
-                if self._vain >= _VAIN + self.task.attempts * len(self._firsts):
-                    raise RuntimeError(
+                if self._vain >= _VAIN + self.call.attempts * len(self._firsts):
+                    raise ChildProcessError(
                         f"{self._vain} processes have ended before they made a row (exit code {process.exitcode})"
                     )
 
 
-def _worker(task: Task, rows: Sequence[Row], first: int, connection: Connection) -> None:
+def _worker(call: Call, rows: Sequence[DataRow], first: int, connection: Connection) -> None:
     """A process of a pool; it ends with the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started it is interrupted, and ends it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        pull(task, rows, first)
+        pull(call, rows, first)
     except HopelessError as hopeless:
         cause = hopeless.__cause__
         assert isinstance(cause, OSError)
@@ -216,8 +219,8 @@ def _end_with_parent() -> None:
 # ---- Ray -------------------------------------------------------------------------------------------------------------
 
 
-def _run_ray(config: DictConfig, task: Task, rows: Sequence[Row], follow: Follow) -> None:
-    """A task a row; Ray begins it again on another process or machine where its own is lost."""
+def _run_ray(config: DictConfig, call: Call, rows: Sequence[DataRow], follow: Follow) -> None:
+    """A call a row; Ray begins it again on another process or machine where its own is lost."""
     ray = importlib.import_module("ray")
     quiet = {"log_to_driver": False, "include_dashboard": False, "logging_level": "ERROR"}
     given = {"address": str(config.cluster), "log_to_driver": False} if config.cluster is not None else quiet
@@ -227,30 +230,53 @@ def _run_ray(config: DictConfig, task: Task, rows: Sequence[Row], follow: Follow
         ray.init(**given)
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         raise ConfigError(f"engine=ray cluster={config.cluster}: {' '.join(str(error).split())}") from error
-    lost = ray.exceptions.RayError
+    lost = threading.Event()
+    threading.Thread(target=_watch_ray, args=(str(ray.get_runtime_context().gcs_address), lost), daemon=True).start()
     try:
-        remote = ray.remote(num_cpus=1, max_retries=task.attempts - 1)(_ray_row)
-        known, waiting, running = ray.put(task), list(reversed(rows)), dict[Any, Row]()
-        most = 2 * (int(config.workers) if config.workers is not None else int(ray.cluster_resources().get("CPU", 1)))
-        while waiting or running:
-            while waiting and len(running) < most:
-                row = waiting.pop()
-                running[remote.remote(known, row)] = row
-            done, _ = ray.wait(list(running), num_returns=1, timeout=1.0)
-            for reference in done:
-                row = running.pop(reference)
-                _finish_ray(ray, reference, task, row)
-            follow()
-    except lost as error:
-        raise RuntimeError(f"engine=ray: the cluster was lost ({type(error).__name__}); the same command goes on") from error
-    finally:
-        ray.shutdown()
+        _spread_ray(ray, config, call, rows, follow)
+    except (KeyboardInterrupt, ray.exceptions.RayError) as error:
+        if isinstance(error, KeyboardInterrupt) and not lost.is_set():
+            ray.shutdown()
+            raise
+        raise ConnectionError("engine=ray: the cluster was lost; the same command goes on where it stopped") from error
+    ray.shutdown()
 
 
-def _ray_row(task: Task, row: Row) -> tuple[int | None, str | None, str | None] | None:
+def _spread_ray(ray: Any, config: DictConfig, call: Call, rows: Sequence[DataRow], follow: Follow) -> None:
+    """Hand rows to Ray, a few more than are made at once."""
+    remote = ray.remote(num_cpus=1, max_retries=call.attempts - 1)(_ray_row)
+    known, waiting, running = ray.put(call), list(reversed(rows)), dict[Any, DataRow]()
+    most = 2 * (int(config.workers) if config.workers is not None else int(ray.cluster_resources().get("CPU", 1)))
+    while waiting or running:
+        while waiting and len(running) < most:
+            row = waiting.pop()
+            running[remote.remote(known, row)] = row
+        done, _ = ray.wait(list(running), num_returns=1, timeout=1.0)
+        for reference in done:
+            _finish_ray(ray, reference, call, running.pop(reference))
+        follow()
+
+
+def _watch_ray(address: str, lost: threading.Event) -> None:
+    """Interrupt the main thread where nobody answers for the cluster any more: Ray itself waits for a minute, and then ends
+    this process."""
+    host, _, port = address.rpartition(":")
+    missed = 0
+    while missed < 3:
+        time.sleep(_SIGN)
+        try:
+            socket.create_connection((host, int(port)), timeout=_SIGN).close()
+            missed = 0
+        except OSError:
+            missed += 1
+    lost.set()
+    _thread.interrupt_main()
+
+
+def _ray_row(call: Call, row: DataRow) -> tuple[int | None, str | None, str | None] | None:
     """A row, in a process of Ray; what the disk says where it refuses."""
     try:
-        make(task, row, claimed=False)
+        make_row(call, row, claimed=False)
     except HopelessError as hopeless:
         cause = hopeless.__cause__
         assert isinstance(cause, OSError)
@@ -258,12 +284,12 @@ def _ray_row(task: Task, row: Row) -> tuple[int | None, str | None, str | None] 
     return None
 
 
-def _finish_ray(ray: Any, reference: Any, task: Task, row: Row) -> None:
-    """Look how a task ended; a row whose processes were killed too often has failed."""
+def _finish_ray(ray: Any, reference: Any, call: Call, row: DataRow) -> None:
+    """Look how a call ended; a row whose processes were killed too often has failed."""
     try:
         refused = ray.get(reference)
     except (ray.exceptions.WorkerCrashedError, ray.exceptions.OutOfMemoryError, ray.exceptions.NodeDiedError) as error:
-        lose(task, row, f"the process that made it was killed {task.attempts} times ({type(error).__name__})")
+        lose(call, row, f"the process that made it was killed {call.attempts} times ({type(error).__name__})")
         return
     if refused is not None:
         raise OSError(*refused)
@@ -275,12 +301,12 @@ def _finish_ray(ray: Any, reference: Any, task: Task, row: Row) -> None:
 class _Job:
     """What a job of an array does: rows, until none is left. SLURM may end it; submitit then sends it in again."""
 
-    def __init__(self, task: Task, rows: Sequence[Row], first: int) -> None:
-        self.task, self.rows, self.first = task, rows, first
+    def __init__(self, call: Call, rows: Sequence[DataRow], first: int) -> None:
+        self.call, self.rows, self.first = call, rows, first
 
     def __call__(self) -> tuple[int | None, str | None, str | None] | None:
         try:
-            Pool(self.task, self.rows, 1, self.first).work(lambda: None, stay=False)
+            Pool(self.call, self.rows, 1, self.first).work(lambda: None, stay=False)
         except OSError as error:
             return error.errno, error.strerror, error.filename
         return None
@@ -290,21 +316,21 @@ class _Job:
         return importlib.import_module("submitit").helpers.DelayedSubmission(self)
 
 
-def _run_slurm(config: DictConfig, task: Task, rows: Sequence[Row], workers: int, follow: Follow) -> None:
+def _run_slurm(config: DictConfig, call: Call, rows: Sequence[DataRow], workers: int, follow: Follow) -> None:
     submitit = importlib.import_module("submitit")
-    logs = Path(task.folder) / "slurm"
-    cluster = None if config.cluster is None else str(config.cluster)
+    logs = Path(call.folder) / "slurm"
+    cluster = str(config.cluster or SLURM)  # submitit would take processes here where it finds no SLURM
     asked = {"name": "hood-dress", "cpus_per_task": 1, "timeout_min": 24 * 60} | dict(plain(config.job) or {})
     try:
         executor = submitit.AutoExecutor(folder=str(logs), cluster=cluster)
         executor.update_parameters(**asked)
         jobs = executor.map_array(
-            lambda job: job(), [_Job(task, rows, place * len(rows) // workers) for place in range(workers)]
+            lambda job: job(), [_Job(call, rows, place * len(rows) // workers) for place in range(workers)]
         )
     except Exception as error:  # of submitit, whose classes do not tell much
         raise ConfigError(f"{_REFUSED}: {' '.join(str(error).split())}") from error
     say(f"{len(jobs)} jobs, {jobs[0].job_id} and on; their logs are in {logs}")
-    manifest, left = Manifest(task.folder, task.since), {row.name for row in rows}
+    manifest, left = Manifest(call.folder, call.since), {row.name for row in rows}
     try:
         while left and not all(job.done() for job in jobs):
             time.sleep(_PAUSE if cluster == "local" else 5.0)

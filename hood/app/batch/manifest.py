@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from hood.app.batch.rows import Row
+from hood.app.batch.rows import DataRow
 from hood.app.settings.compose import ConfigError, brief
 from hood.assets.files.library import locate
 
@@ -96,7 +96,7 @@ def own_line(folder: Path) -> Line | None:
         return None
 
 
-def mend(folder: Path, rows: Iterable[Row]) -> int:
+def mend_manifest(folder: Path, rows: Iterable[DataRow]) -> int:
     """Append the lines of rows whose folders are in place, and which the manifest has lost by a kill or a full disk; returns
     how many there were."""
     known, count = read_manifest(folder), 0
@@ -108,7 +108,7 @@ def mend(folder: Path, rows: Iterable[Row]) -> int:
     return count
 
 
-def require_same_rows(folder: Path, rows: Iterable[Row], known: Mapping[str, Line]) -> None:
+def require_same_rows(folder: Path, rows: Iterable[DataRow], known: Mapping[str, Line]) -> None:
     """Raise ConfigError where a row of the manifest was made with other settings than it would be now; names key and row.
 
     A file that has another place but the same content is the same.
@@ -128,17 +128,17 @@ def require_same_rows(folder: Path, rows: Iterable[Row], known: Mapping[str, Lin
 
 def _is_same_file(line: Line, key: str, name: str | None) -> bool:
     before = line.get("inputs", {}).get(key)
-    return key in _FILES and name is not None and before is not None and before == digest(key, name)
+    return key in _FILES and name is not None and before is not None and before == input_digest(key, name)
 
 
-def open_rows(folder: Path, rows: Sequence[Row], known: Mapping[str, Line], retry: str) -> tuple[list[Row], list[str]]:
+def open_rows(folder: Path, rows: Sequence[DataRow], known: Mapping[str, Line], retry: str) -> tuple[list[DataRow], list[str]]:
     """The rows that are to be made, and sentences on those of them that were made before.
 
     Args:
         retry: ``none``, ``failed`` or ``unsound``, which means both.
     """
     again = {"none": (), "failed": (FAILED,), "unsound": (FAILED, UNSOUND)}[retry]
-    left, changed, lost = list[Row](), 0, 0
+    left, changed, lost = list[DataRow](), 0, 0
     for row in rows:
         line = known.get(row.name)
         if line is None or line["verdict"] in again:
@@ -148,19 +148,19 @@ def open_rows(folder: Path, rows: Sequence[Row], known: Mapping[str, Line], retr
         elif not (folder / row.name / "rollout.h5").exists():
             left.append(row)
             lost += 1
-        elif any(before != digest(key, row.keys.get(key, "")) for key, before in line.get("inputs", {}).items()):
+        elif any(before != input_digest(key, row.keys.get(key, "")) for key, before in line.get("inputs", {}).items()):
             left.append(row)
             changed += 1
     said = [f"{changed} rows are made again: their files have other content now"] if changed else []
     return left, [*said, f"{lost} rows are made again: their folders are gone"] if lost else said
 
 
-def inputs_of(row: Row) -> dict[str, str]:
+def inputs_of(row: DataRow) -> dict[str, str]:
     """SHA-256 of what stands behind the names of garment, body and motion; of an outfit one for all."""
-    return {key: digest(key, row.keys[key]) for key in _FILES if key in row.keys}
+    return {key: input_digest(key, row.keys[key]) for key in _FILES if key in row.keys}
 
 
-def digest(key: str, value: str) -> str:
+def input_digest(key: str, value: str) -> str:
     """SHA-256 of the file or folder, or files, that a word names; ``none`` where there is none that can be read."""
     found = hashlib.sha256()
     for name in value.strip("[]").split(",") if value.startswith("[") else [value]:

@@ -16,8 +16,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from hood.app.batch.batch import require_motions
-from hood.app.batch.folders import place_motions
+from hood.app.batch.batch import place_motions, require_motions
 from hood.app.settings.compose import ConfigError, load_config, options, plain, shown
 from hood.app.settings.python_words import overrides
 from hood.assets.files.library import locate, names, unknown
@@ -27,7 +26,7 @@ from hood.assets.motion.motion_files import find_motions
 from hood.scene.body_motion.load import NO_MOTION
 
 #: Lists of the command, the key of a rollout that an entry stands for, and what that is called among assets.
-_AXES = {
+AXES = {
     "garments": ("garment", "garments"),
     "bodies": ("body", "body"),
     "fabrics": ("material", ""),
@@ -42,7 +41,7 @@ _LABEL = re.compile(r"[\w.,=+-]+")
 
 
 @dataclass(frozen=True)
-class Row:
+class DataRow:
     """One rollout of a data set.
 
     Args:
@@ -67,7 +66,7 @@ class _Entry:
     keys: Mapping[str, Any]
 
 
-def rows_of(config: DictConfig, given: Sequence[str]) -> tuple[list[Row], str]:
+def rows_of(config: DictConfig, given: Sequence[str]) -> tuple[list[DataRow], str]:
     """The rows that a command asks for, those of one garment, body and fabric one after the other, and the folder from which
     they are named after their motions; empty without one.
 
@@ -81,7 +80,7 @@ def rows_of(config: DictConfig, given: Sequence[str]) -> tuple[list[Row], str]:
     if config.rows is None:
         rows, start = _product(config)
     else:
-        beside = next((key for key in (*_AXES, "per_motion") if key in given), None)
+        beside = next((key for key in (*AXES, "per_motion") if key in given), None)
         if beside is not None:
             raise ConfigError(f"{beside}: the rows come from rows={config.rows}; leave one of the two out")
         rows, start = _listed(Path(str(config.rows)).expanduser(), config.root, int(config.seed))
@@ -94,7 +93,7 @@ def row_seed(seed: int, name: str) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:4], "big") >> 1
 
 
-def _product(config: DictConfig) -> tuple[list[Row], str]:
+def _product(config: DictConfig) -> tuple[list[DataRow], str]:
     garments, bodies, fabrics = (_entries(config, axis) for axis in ("garments", "bodies", "fabrics"))
     motions, start = _motions(config)
     combined = list(itertools.product(garments, bodies, fabrics))
@@ -109,10 +108,10 @@ def _product(config: DictConfig) -> tuple[list[Row], str]:
     return rows, start
 
 
-def _row(name: str, keys: Mapping[str, Any], seed: int) -> Row:
+def _row(name: str, keys: Mapping[str, Any], seed: int) -> DataRow:
     """``keys`` by value; a text that a file has stays as it is."""
     words = overrides({"seed": row_seed(seed, name), **keys})
-    return Row(name, tuple(words))
+    return DataRow(name, tuple(words))
 
 
 def _drawn(config: DictConfig, motion: str, count: int) -> set[int]:
@@ -127,7 +126,7 @@ def _drawn(config: DictConfig, motion: str, count: int) -> set[int]:
 
 def _entries(config: DictConfig, axis: str) -> list[_Entry]:
     """The entries of a list; a name that is typed wrongly is refused here, a file that cannot be used costs its rows."""
-    key, kind = _AXES[axis]
+    key, kind = AXES[axis]
     found: dict[str, _Entry] = {}
     for index, value in enumerate(plain(config[axis])):
         entry = _entry(f"{axis}[{index}]", key, value)
@@ -151,7 +150,8 @@ def _entry(place: str, key: str, value: Any) -> _Entry:
     label = keys.pop("name", None)
     if label is None:
         parts = [_label_of(keys[key])] if key in keys else []
-        label = ",".join([*parts, *(f"{name}={shown(item)}" for name, item in keys.items() if name != key)])
+        parts += [re.sub(r"[][{}()'\"\s]", "", f"{name}={shown(item)}") for name, item in keys.items() if name != key]
+        label = ",".join(parts)
     if key in keys:
         keys[key] = _absolute(key, keys[key])
     elif key == "sequence":
@@ -176,7 +176,7 @@ def _named(value: Any) -> list[str]:
 
 def _absolute(key: str, value: Any, folder: Path | None = None) -> Any:
     """Files by their whole path, embedded names as they are. Those of a file of rows may lie in its ``folder``."""
-    kind = next((kind for one, kind in _AXES.values() if one == key), "")
+    kind = next((kind for one, kind in AXES.values() if one == key), "")
     if not kind:
         return value
     if isinstance(value, list):
@@ -224,13 +224,13 @@ def _places(found: Sequence[str], root: str | None) -> tuple[dict[str, str], str
     return {name: folder.as_posix() for name, folder in zip(found, folders, strict=True)}, str(start) if has_files else ""
 
 
-def _listed(path: Path, root: str | None, seed: int) -> tuple[list[Row], str]:
+def _listed(path: Path, root: str | None, seed: int) -> tuple[list[DataRow], str]:
     """The rows of a file."""
     lines = _read(path)
     keyed = []
     for place, given in lines:
         keys = _checked(given, place)
-        keys |= {key: _absolute(key, keys[key], path.parent.absolute()) for key, _ in _AXES.values() if key in keys}
+        keys |= {key: _absolute(key, keys[key], path.parent.absolute()) for key, _ in AXES.values() if key in keys}
         keyed.append((place, keys))
     found = list(dict.fromkeys(str(keys["sequence"]) for _, keys in keyed if "sequence" in keys))
     places, start = _places(found, root)
@@ -248,17 +248,17 @@ def _listed(path: Path, root: str | None, seed: int) -> tuple[list[Row], str]:
 
 def _read(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """The lines of a file of rows, each behind its place there."""
+    if path.suffix.lower() not in (".csv", ".jsonl"):
+        raise ConfigError(f"rows={path}: give a .csv table or a .jsonl file")
     text = read_text(path)
     if path.suffix.lower() == ".csv":
         table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
         found = [(f"{path}, row {number}", _cells(f"{path}, row {number}", cells)) for number, cells in enumerate(table, 2)]
-    elif path.suffix.lower() == ".jsonl":
+    else:
         found = []
         for number, line in enumerate(text.splitlines(), 1):
             if line.strip():
                 found.append((f"{path}, line {number}", _object(f"{path}, line {number}", line)))
-    else:
-        raise ConfigError(f"rows={path}: give a .csv table or a .jsonl file")
     if not found:
         raise ConfigError(f"rows={path}: has no rows")
     return found
@@ -308,9 +308,9 @@ def _checked_name(name: str, place: str) -> str:
     return path.as_posix()
 
 
-def _require_apart(rows: Sequence[Row]) -> None:
+def _require_apart(rows: Sequence[DataRow]) -> None:
     """Raise ConfigError where two rows would share a folder, or one lie in that of the other."""
-    known: dict[str, Row] = {}
+    known: dict[str, DataRow] = {}
     for row in rows:
         if row.name in known:
             raise ConfigError(f"two rows would both go to {row.name}; give them names, in a column or a key name")

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 from hood.app.batch.manifest import DOUBTFUL, FAILED, OWN_LINE, SOUND, UNJUDGED, UNSOUND, Line, Manifest, inputs_of, own_line
-from hood.app.batch.rows import Row
+from hood.app.batch.rows import DataRow
 from hood.app.notices import Item
 from hood.app.rollout import roll_out_into
 from hood.app.settings.compose import plain
@@ -44,7 +44,7 @@ _FREE = ("output", "root", "resume", "fail_on")
 
 
 @dataclass(frozen=True)
-class Task:
+class Call:
     """What all processes of a call know.
 
     Args:
@@ -64,7 +64,7 @@ class HopelessError(Exception):
     """No further row can be written; the cause is an OSError."""
 
 
-def pull(task: Task, rows: Sequence[Row], first: int = 0) -> None:
+def pull(call: Call, rows: Sequence[DataRow], first: int = 0) -> None:
     """Make rows that are not done and that nobody works on, from the place ``first`` on round to it again, until there are
     none.
 
@@ -72,54 +72,54 @@ def pull(task: Task, rows: Sequence[Row], first: int = 0) -> None:
         HopelessError: the disk refuses.
     """
     torch.set_num_threads(1)
-    manifest, done = Manifest(task.folder, task.since), set[str]()
+    manifest, done = Manifest(call.folder, call.since), set[str]()
     while True:
         made = 0
         for row in [*rows[first:], *rows[:first]]:
             done |= {line["row"] for line in manifest.new()}
             if row.name not in done:
-                made += make(task, row)
+                made += make_row(call, row)
         if not made:
             return
 
 
-def make(task: Task, row: Row, claimed: bool = True) -> bool:
+def make_row(call: Call, row: DataRow, claimed: bool = True) -> bool:
     """Make a row and write its line; False where another process works on it, or has just done it.
 
     Args:
         claimed: whether processes tell each other; False where something else sees to it that none has another's row.
     """
-    with _claim(task, row) if claimed else _alone() as attempt:
-        if attempt is None or claimed and any(line["row"] == row.name for line in Manifest(task.folder, task.since).new()):
+    with _claim(call, row) if claimed else _alone() as attempt:
+        if attempt is None or claimed and any(line["row"] == row.name for line in Manifest(call.folder, call.since).new()):
             return False
-        if attempt > task.attempts:
-            sentence = f"the process that made it was killed {task.attempts} times, as where memory is short"
-            lose(task, row, sentence)
+        if attempt > call.attempts:
+            sentence = f"the process that made it was killed {call.attempts} times, as where memory is short"
+            lose(call, row, sentence)
             return True
         try:
-            _append(task, _made(task, row, attempt))
+            _append(call, _made(call, row, attempt))
         except OSError as error:
             raise HopelessError from error
         return True
 
 
-def lose(task: Task, row: Row, sentence: str) -> None:
+def lose(call: Call, row: DataRow, sentence: str) -> None:
     """Write that a row failed."""
-    _append(task, _line(row, {}) | _failure(sentence) | {"attempts": task.attempts})
+    _append(call, _line(row, {}) | _failure(sentence) | {"attempts": call.attempts})
 
 
-def _append(task: Task, line: Line) -> None:
-    Manifest(task.folder).append(line)
+def _append(call: Call, line: Line) -> None:
+    Manifest(call.folder).append(line)
 
 
-def _made(task: Task, row: Row, attempt: int) -> Line:
+def _made(call: Call, row: DataRow, attempt: int) -> Line:
     """The line of a row that has been made, or has failed. Raises OSError where the disk refuses."""
-    began, spent, place = time.perf_counter(), time.process_time(), task.folder / row.name
-    temporary = task.folder / _WORK / f"{_code(row)}.{os.getpid()}"
+    began, spent, place = time.perf_counter(), time.process_time(), call.folder / row.name
+    temporary = call.folder / _WORK / f"{_code(row)}.{os.getpid()}"
     line = _line(row, inputs_of(row)) | {"attempts": attempt}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        config = RolloutSettings.from_words([*task.words, *row.words]).with_values(output=str(place))
+        config = RolloutSettings.from_words([*call.words, *row.words]).with_values(output=str(place))
         check_config(config)
         stepper, weights = make_stepper(config)
         summary = roll_out_into(config, stepper, weights, silently, temporary)
@@ -148,7 +148,7 @@ def silently(items: Iterable[Item], total: int, what: str) -> Iterable[Item]:
     return items
 
 
-def _line(row: Row, inputs: Mapping[str, str]) -> Line:
+def _line(row: DataRow, inputs: Mapping[str, str]) -> Line:
     """What a line says in any case."""
     ended = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return {"row": row.name, "verdict": FAILED, "settings": row.keys, "inputs": inputs, "host": platform.node(), "time": ended}
@@ -202,7 +202,7 @@ def _put(temporary: Path, place: Path) -> None:
     shutil.rmtree(before, ignore_errors=True)
 
 
-def _code(row: Row) -> str:
+def _code(row: DataRow) -> str:
     """A file name for a row."""
     return hashlib.sha256(row.name.encode()).hexdigest()[:20]
 
@@ -216,12 +216,12 @@ def _alone() -> Iterator[int]:
 
 
 @contextmanager
-def _claim(task: Task, row: Row) -> Iterator[int | None]:
+def _claim(call: Call, row: DataRow) -> Iterator[int | None]:
     """Hold a row: yields which attempt this is, from 1 on; None where another process holds it.
 
     The file of a process that was killed stays, and counts.
     """
-    path = _claims(task.folder) / _code(row)
+    path = _claims(call.folder) / _code(row)
     attempt = _take(path)
     if attempt is None:
         yield None
@@ -331,7 +331,7 @@ def _give_signs(path: Path, ended: threading.Event) -> None:
             return
 
 
-def is_held(folder: Path, row: Row) -> bool:
+def is_held(folder: Path, row: DataRow) -> bool:
     """Whether a process works on a row."""
     path = _claims(folder) / _code(row)
     owner = _owner(path) if path.exists() else None
