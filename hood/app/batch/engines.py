@@ -207,6 +207,7 @@ def _worker(call: Call, rows: Sequence[DataRow], first: int, connection: Connect
         cause = hopeless.__cause__
         assert isinstance(cause, OSError)
         connection.send(OSError(cause.errno, cause.strerror, cause.filename))
+        os._exit(0)  # HDF5 would try to write what is open, and print that it cannot
 
 
 def _end_with_parent() -> None:

@@ -129,13 +129,25 @@ def _made(call: Call, row: DataRow, attempt: int) -> Line:
         _put(temporary, place)
     except Exception as error:  # whatever is wrong with a row costs that row
         shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno in _HOPELESS:
-            raise
+        refused = _refusal(error)
+        if refused is not None:
+            raise OSError(refused, os.strerror(refused), str(call.folder)) from error
         known = isinstance(error, (ValueError, OSError, ImportError, MemoryError))
         text = " ".join(str(error).split()) or type(error).__name__
         sentence = text if known else f"{type(error).__name__}: {text}"
         return line | _failure(sentence) | _times(began, spent)
     return line
+
+
+def _refusal(error: BaseException | None) -> int | None:
+    """The number of the system's error where the disk has refused; HDF5 says it in a text, or on the way to another error."""
+    while error is not None:
+        told = re.search(r"\berrno = (\d+)", str(error))
+        number = error.errno if isinstance(error, OSError) and error.errno else int(told[1]) if told else 0
+        if number in _HOPELESS:
+            return number
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _times(began: float, spent: float) -> Line:

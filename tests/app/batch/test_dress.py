@@ -186,16 +186,26 @@ def test_a_set_with_a_broken_row_goes_on_and_is_not_made_twice(
     assert len(read_manifest(Path("out"))) == 3
 
 
-def test_a_full_disk_ends_the_work_and_keeps_what_is_done(motions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device", "out/x"),
+        RuntimeError("Unable to flush file (file write failed: errno = 28, error message = 'No space left on device')"),
+    ],
+)
+def test_a_full_disk_ends_the_work_and_fails_no_row(error: Exception, motions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     call = Call(Path("out"), ("stepper=guess",), 3, 0)
     Path("out").mkdir()
 
     def full(*arguments: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", "out/x")
+        raise error
 
     monkeypatch.setattr(work, "roll_out_into", full)
-    with pytest.raises(HopelessError):
+    with pytest.raises(HopelessError) as raised:
         pull(call, planned("garments=[tank]", "motions=[motions]"))
+    cause = raised.value.__cause__
+    assert isinstance(cause, OSError)
+    assert (cause.errno, cause.filename) == (errno.ENOSPC, "out")
     assert read_manifest(Path("out")) == {}
 
 
