@@ -13,14 +13,14 @@ from packaging.tags import platform_tags
 
 
 class NativeHook(BuildHookInterface[Any]):
-    """Compiles what ``hood/native/libraries.py`` lists and adds it to the wheel."""
+    """Compiles what ``hood/native/build.py`` lists and adds it to the wheel."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Editable installations have the sources at hand and compile at the first use."""
         if version == "editable":
             return
         sys.path.insert(0, self.root)  # hood.native needs nothing but the standard library
-        libraries = importlib.import_module("hood.native.libraries")
+        libraries = importlib.import_module("hood.native.build")
         self._folder = tempfile.TemporaryDirectory()
         made, left_out = libraries.make(Path(self._folder.name))
         for sentence in left_out:

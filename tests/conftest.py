@@ -17,8 +17,7 @@ from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import cloth_proximity
-from hood.native.build import BuildError, keep
-from hood.native.libraries import LIBRARIES
+from hood.native.build import LIBRARIES, BuildError, keep
 from hood.scene.scene import Scene, build_scene
 from hood.testing import cylinder
 

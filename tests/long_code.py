@@ -2,6 +2,11 @@
 
 MODULES = {
     "hood/api.py": "the Python interface: five functions whose docstrings are the reference",
+    "hood/app/batch/batch.py": "many motions in one command: their folders, what is finished there, the summary over all",
+    "hood/app/batch/dress.py": "one command: its words, what it tells, its end, and the dry run",
+    "hood/app/batch/engines.py": "four engines with one task, of which the pool of processes is a part",
+    "hood/app/batch/rows.py": "what a row is: from lists, tables and files, with its name and its seed",
+    "hood/app/batch/work.py": "one row: who takes it, how it is made, how it gets its place",
     "hood/app/output/export.py": "one command: what may be written, what was there before, images on garments, the write",
     "hood/app/rollout.py": "one rollout from its words to its summary",
     "hood/app/scene/events.py": "the key `events`: its grammar, its effect, what the summary says of it",

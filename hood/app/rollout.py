@@ -13,8 +13,17 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hood.app.batch.batch import Job, find_jobs, share, with_one_stepper, write_overview
-from hood.app.batch.folders import as_begun, motion_attributes, refuse_others, resumed
+from hood.app.batch.batch import (
+    Job,
+    as_begun,
+    find_jobs,
+    motion_attributes,
+    refuse_others,
+    resumed,
+    share,
+    with_one_stepper,
+    write_overview,
+)
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier
@@ -125,7 +134,22 @@ def _run_one(
     """The rollout of one motion with all its files: the summary, and whether the user interrupted it. Where many are run
     none may replace another's, and none is the place for advice on the stepper."""
     with heard() as warned:
-        return _run_heard(config, stepper, digest, warned, bar, alone)
+        return _run_heard(config, stepper, digest, warned, bar, alone, output_folder(config))
+
+
+def roll_out_into(config: RolloutSettings, stepper: Stepper, digest: str, bar: Bar, folder: Path) -> dict[str, Any]:
+    """The rollout of one motion with all its files, written into another folder than ``config.output``, where the caller puts
+    it; returns the summary.
+
+    Raises:
+        ConfigError, ValueError, OSError: settings or files that cannot be used.
+        KeyboardInterrupt: the user interrupted it; frames done may be there.
+    """
+    with heard() as warned:
+        summary, interrupted = _run_heard(config, stepper, digest, warned, bar, False, folder)
+    if interrupted:
+        raise KeyboardInterrupt
+    return summary
 
 
 def _tell(sentences: Sequence[str]) -> None:
@@ -147,23 +171,22 @@ def _first_positions(path: Path, count: int) -> np.ndarray:
 
 
 def _run_heard(
-    config: RolloutSettings, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool
+    config: RolloutSettings, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool, folder: Path
 ) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
     check_worn(read_textures(config), ready.scene.garment)
-    with occupy(prepare_folder(output_folder(config))):
+    with occupy(prepare_folder(folder)):
         if not alone:
-            refuse_others(output_folder(config), str(config.sequence))
-        return _run_there(ready, config, digest, warned, bar, alone)
+            refuse_others(folder, str(config.sequence))
+        return _run_there(ready, config, digest, warned, bar, alone, folder)
 
 
 def _run_there(
-    ready: Setup, asked: RolloutSettings, digest: str, warned: Heard, bar: Bar, advise: bool
+    ready: Setup, asked: RolloutSettings, digest: str, warned: Heard, bar: Bar, advise: bool, folder: Path
 ) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held."""
     config = ready.config
-    folder = output_folder(config)
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []

@@ -25,6 +25,11 @@ _EXAMPLES = {
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
         "hood rollout garment=my_shirt.obj sequence=CMU_01_poses.npz material=denim",
     ],
+    "dress": [
+        "hood dress garments=[dress,tshirt] bodies=[default,{betas:[1.5],name:tall}] motions=[amass/CMU] output=outputs/set",
+        "hood dress rows=rows.csv dry_run=true",
+        "hood dress motions=[amass] root=amass output=outputs/set engine=slurm workers=40",
+    ],
     "plan": [
         "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
         "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
@@ -79,8 +84,8 @@ _BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE 
 #: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.
 _NAMED = {
     "garments": ("garment", "garments", "garments_4k", "data.garments"),
-    "motions": ("sequence", "sequences", "data.sequences"),
-    "body": ("body", "data.body"),
+    "motions": ("sequence", "sequences", "motions", "data.sequences"),
+    "body": ("body", "bodies", "data.body"),
     "weights": ("checkpoint", "models", "weights"),
 }
 _ABSENT = object()
@@ -104,6 +109,8 @@ def describe(name: str) -> str:
     if name == "plan":
         lines += ["", "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …"]
         lines += ["The keys of hood train say a training; experiment=, trainer= or data.* has to be among them."]
+    if name == "dress":
+        lines += ["", "All other keys are those of hood rollout, the same for all rows: stepper, num_frames, fps, metrics, …"]
     if name == "fabric":
         lines += ["", textwrap.fill(f"  {'NAME':<14}{' '.join(options('material'))}", 118, subsequent_indent=" " * 16)]
     groups = _groups_of(name)
@@ -116,7 +123,7 @@ def describe(name: str) -> str:
         within = notes(f"{group}/{option}")
         lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
     lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
-    if groups or name in ("tradeoff", "envelope"):
+    if groups or name in ("dress", "tradeoff", "envelope"):
         lines += _names(config)
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
     return "\n".join(lines)

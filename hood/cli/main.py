@@ -28,6 +28,7 @@ ENVIRONMENT = {
 _OF_MALLOPT = {"MALLOC_TRIM_THRESHOLD_": -1, "MALLOC_TOP_PAD_": -2, "MALLOC_MMAP_THRESHOLD_": -3}
 COMMANDS = {
     "rollout": "simulate garments on a moving body: positions, a film, a verdict",
+    "dress": "simulate a data set: garments on bodies in many motions, on all cores or a cluster",
     "view": "write rollouts as one HTML page to turn and play in a browser",
     "compare": "film rollouts of one motion side by side, coloured by strain, unbalanced force or distance",
     "export": "write a rollout for other programs: USD, glTF, PC2, OBJ, PLY",
@@ -46,6 +47,7 @@ COMMANDS = {
 #: Where each of them lives; the others, and those of installed packages, are registered (:mod:`hood.plugins`).
 _HOMES = {
     "rollout": "hood.cli.rollout:run",
+    "dress": "hood.cli.rollout:dressed",
     "view": "hood.cli.compare:view",
     "compare": "hood.cli.compare:run",
     "export": "hood.cli.export:run",
@@ -62,15 +64,15 @@ _HOMES = {
 EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
-    2: "an error, told in one line; rollout: a motion of many could not be used, the others are there",
-    3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; see summary.json",
+    2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed",
+    3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; dress: too many are",
     130: "interrupted; what is done is kept",
 }
 
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
+_SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -208,9 +210,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
     if arguments and arguments[0] in _SIMULATE and not any(word in ("-h", "--help") for word in arguments):
-        from hood.native import libraries
-
-        libraries.start()
+        build.start()
     try:
         code = main(arguments)
         sys.stdout.flush()

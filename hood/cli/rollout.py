@@ -1,4 +1,5 @@
-"""``hood rollout`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout` and :mod:`hood.app.train`."""
+"""``hood rollout``, ``hood dress`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout`,
+:mod:`hood.app.batch.dress` and :mod:`hood.app.train`."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
+from hood.app.batch.dress import dress_rows
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
@@ -38,6 +40,12 @@ def code_of(done: Rollouts) -> int:
     for sentence in said:
         print(f"hood: {sentence}", file=sys.stderr)
     return code
+
+
+def dressed(overrides: Sequence[str]) -> int:
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where more rows failed than
+    ``fail_fraction`` says, else 3 where more are unsound, else 0."""
+    return dress_rows(overrides).code
 
 
 def train(overrides: Sequence[str]) -> int:

@@ -20,8 +20,7 @@ import numpy as np
 from hood import native
 from hood.mesh import topology
 from hood.native.arguments import COUNT, POINTER, REAL, fields
-from hood.native.build import build
-from hood.native.libraries import LAYER_FLAGS
+from hood.native.build import LAYER_FLAGS, build
 
 _SOURCE = Path(native.__file__).with_name("layers.cpp")
 #: Of the distance of two features at least this share is left by one move.

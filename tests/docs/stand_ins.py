@@ -53,7 +53,8 @@ class Desk:
             (r"shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
-            (r"(first|second|part00)\.txt", self.list_of_motions),
+            (r"(first|second)\.txt", self.list_of_motions),
+            (r"rows\.csv", self.rows),
             (r"hero\.glb", self.hero),
             (r"models/SMPLX_NEUTRAL\.npz", self.smplx),
             (r"pieces/.*\.npz", self.piece),
@@ -181,6 +182,10 @@ class Desk:
         """One of the two recordings in the folder ``amass``."""
         entry = "amass/01_poses.npz" if name == "first.txt" else "amass/02_poses.npz"
         return self._once(name, lambda folder: (folder / name).write_text(entry, encoding="utf-8")) / name
+
+    def rows(self, name: str, words: Sequence[str]) -> Path:
+        text = "garment,sequence,size\ntank,plie,1.05\n"
+        return self._once(name, lambda folder: (folder / name).write_text(text, encoding="utf-8")) / name
 
     def hero(self, name: str, words: Sequence[str]) -> Path:
         return Path(self.workshop.body("gltf_skin"))

@@ -55,6 +55,13 @@ def check_command(command: str, keys: list[str]) -> None:
         load_config("plan", [word for word in keys if word.partition("=")[0] in own])
         keys = [word for word in keys if word.partition("=")[0] not in own]
         command = "train" if is_training(keys) else "rollout"
+    if command == "dress":
+        own = set(load_config("dress"))
+        config = load_config("dress", [word for word in keys if word.partition("=")[0] in own and "=[" in word])
+        for key, kind in (("garments", "garments"), ("fabrics", "")):
+            known = names(kind) if kind else options("material")
+            assert {str(name) for name in config[key] if isinstance(name, str)} <= {*known}, key
+        command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
     config = load_config(command, keys)
     if command == "rollout":
         check_config(config)

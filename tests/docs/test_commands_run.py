@@ -41,6 +41,8 @@ SHORT = (
     Short("^rollout(?!.*formats=).*texture=", ("formats=[glb]",), "an image is for pictures and exports; none are drawn"),
     Short("^rollout.*=dress_12k", ("garment=dress",), "another resolution of the same garment"),
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
+    Short("^dress", ("num_frames=2", "workers=1", "engine=local"), "one process here; engines have tests elsewhere"),
+    Short("^dress(?!.*rows=)", ("garments=[tank]", "fabrics=[default]"), "two rows; their product has tests elsewhere"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
     Short(
         "^train.*paper_fast.*time_scale=0.13", ("trainer.iterations=15", "trainer.statistics_iterations=1"),
@@ -85,6 +87,7 @@ CHOICES = {
     r"weights=NAME": "weights=quickstart model=passes",
     r"inspect FILE$": "inspect my_shirt.obj",
     r"checkpoint=…": "checkpoint=A/model.safetensors",
+    r"hood dress$": "hood dress motions=plie",
     r"refine=…ms": "refine=50ms",
     r" size=…": " size=1.1",
     r",…\]": "]",
@@ -96,6 +99,7 @@ EXIT_CODES = {
 }
 #: Lines that wait for ``-m slow``, and which of the others are like them.
 SLOW = (
+    (r"^dress .*(dry_run|engine)", "other engines and the dry run, which have tests elsewhere; the line of rows is run"),
     (r"^evaluate .*models=\[(?!runs/(mine|fine15))(?!.*SMPL_)", "rows of other models, as of a run, a network and the solver"),
     (r"^fabric chiffon", "thirteen fabrics, as of two"),
     (r"^train .*weights=[B-E]/|^train model=edges .*weights=", "further stages of recipes, as the first two of one"),
@@ -156,6 +160,12 @@ def promised(words: Sequence[str]) -> list[str]:
         names = ["rollout.h5", "summary.json", "config.yaml", *(f"rollout.{name}" for name in formats)]
         many = "/*" if re.search(r"sequence=(amass|\w+\.txt)", " ".join(words)) else ""
         return [f"{folder}{many}/{name}" for name in names]
+    if command == "dress":
+        return (
+            []
+            if "dry_run=true" in words
+            else [f"{output or 'outputs/dress'}/{name}" for name in ("manifest.jsonl", "*/*/*/*/rollout.h5")]
+        )
     if command in ("inspect", "fabric") and not output:
         return []
     if command == "export":

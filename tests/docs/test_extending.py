@@ -21,7 +21,7 @@ from hood.app.settings.compose import load_config
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
 from hood.cli.main import main
-from hood.model.features.sets import SetSettings, build_features
+from hood.model.parts import SetSettings, build_features
 from hood.steppers.checkpoint import load_simulator, read_header, save_simulator
 from hood.steppers.network import build_simulator
 from hood.studies.envelope.tasks import command_of, make_tasks

@@ -9,7 +9,6 @@ import threading
 from pathlib import Path
 
 from hood.native import build as native_build
-from hood.native import libraries
 from hood.native.build import build, keep
 
 FLAGS = ("-O0", "-shared", "-fPIC")
@@ -40,8 +39,8 @@ def test_nothing_is_made_where_nothing_is_kept(source, monkeypatch):
 def test_all_that_a_wheel_would_carry_is_made(source, monkeypatch):
     other = source.with_name("other.cpp")
     other.write_text(source.read_text().replace("42", "43"))
-    monkeypatch.setattr(libraries, "LIBRARIES", ((source, FLAGS), (other, FLAGS)))
-    libraries._make(threading.Event())
+    monkeypatch.setattr(native_build, "LIBRARIES", ((source, FLAGS), (other, FLAGS)))
+    native_build._make_all(threading.Event())
     assert len(kept(source)) == 2
     assert build(other, FLAGS).answer() == 43
 
@@ -51,8 +50,8 @@ def test_a_program_that_ends_first_stops_the_compiler_and_leaves_nothing(source)
     script.write_text('#!/bin/sh\n[ "$1" = --version ] && exit 0\ntouch "$(dirname "$0")/begun"\nexec sleep 60\n')
     script.chmod(0o755)
     code = (
-        "import time; from pathlib import Path; from hood.native import libraries\n"
-        f"libraries.LIBRARIES = ((Path({str(source)!r}), {FLAGS!r}),); libraries.start()\n"
+        "import time; from pathlib import Path; from hood.native import build\n"
+        f"build.LIBRARIES = ((Path({str(source)!r}), {FLAGS!r}),); build.start()\n"
         f"while not Path({str(source.parent / 'begun')!r}).exists(): time.sleep(0.01)\n"
     )
     environment = {**os.environ, "CXX": str(script)}

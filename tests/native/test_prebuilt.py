@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hood.native import build as native_build
-from hood.native import libraries, prebuilt
+from hood.native import prebuilt
 from hood.native.build import BuildError, build, find_compiler
 from hood.native.prebuilt import Level
 
@@ -22,13 +22,13 @@ def source(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     """A source whose library says for which of two generations it was made."""
     path = tmp_path / "lanes.cpp"
     path.write_text(SOURCE)
-    for module in (prebuilt, libraries):
+    for module in (prebuilt, native_build):
         monkeypatch.setattr(module, "levels", lambda: LEVELS)
-    monkeypatch.setattr(libraries, "LIBRARIES", ((path, FLAGS),))
-    monkeypatch.setattr(libraries, "SELDOM", ())
+    monkeypatch.setattr(native_build, "LIBRARIES", ((path, FLAGS),))
+    monkeypatch.setattr(native_build, "SELDOM", ())
     chosen = {"wide": "-DWIDE", "plain": "-DPLAIN"}
     monkeypatch.setattr(
-        libraries,
+        native_build,
         "flags_for",
         lambda flags, level: [chosen[level.name] if flag == "-march=native" else flag for flag in flags],
     )
@@ -36,7 +36,7 @@ def source(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def test_the_widest_that_the_processor_can_run_is_taken(source, tmp_path):
-    made, left_out = libraries.make(tmp_path)
+    made, left_out = native_build.make(tmp_path)
     assert len(made) == 2
     assert not left_out
     assert prebuilt.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 16
@@ -44,7 +44,7 @@ def test_the_widest_that_the_processor_can_run_is_taken(source, tmp_path):
 
 
 def test_no_compiler_is_needed_where_a_library_is_prebuilt(source, tmp_path, monkeypatch):
-    libraries.make(tmp_path)
+    native_build.make(tmp_path)
     monkeypatch.setattr(native_build, "FOLDER", tmp_path)
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert build(source, FLAGS).lanes() == 2
@@ -54,18 +54,18 @@ def test_no_compiler_is_needed_where_a_library_is_prebuilt(source, tmp_path, mon
 
 
 def test_a_damaged_library_leaves_the_next(source, tmp_path):
-    made, _ = libraries.make(tmp_path)
+    made, _ = native_build.make(tmp_path)
     next(path for path in made if "wide" in path.name).write_bytes(b"half a file")
     assert prebuilt.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 2
 
 
 def test_what_cannot_be_compiled_is_left_out_and_named(source, tmp_path, monkeypatch):
     source.write_text("no C++")
-    made, left_out = libraries.make(tmp_path)
+    made, left_out = native_build.make(tmp_path)
     assert not made
     assert all("the wheel is without lanes-" in sentence for sentence in left_out)
     monkeypatch.setenv("CXX", "no-such-compiler")
-    assert libraries.make(tmp_path) == ([], ["the wheel carries no compiled parts: " + str(_no_compiler())])
+    assert native_build.make(tmp_path) == ([], ["the wheel carries no compiled parts: " + str(_no_compiler())])
 
 
 def test_the_list_names_what_the_modules_ask_for():
@@ -73,8 +73,8 @@ def test_the_list_names_what_the_modules_ask_for():
     from hood.mesh.closest_point import tree
     from hood.solver.compiled import newton
 
-    assert (newton.SOURCE, libraries.WIDE_FLAGS) in libraries.SELDOM
-    listed = {path for path, _ in libraries.LIBRARIES}
+    assert (newton.SOURCE, native_build.WIDE_FLAGS) in native_build.SELDOM
+    listed = {path for path, _ in native_build.LIBRARIES}
     assert {newton.SOURCE, tree.SOURCE, raster.SOURCE} <= listed
     assert all(path.exists() for path in listed)
 

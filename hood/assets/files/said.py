@@ -84,6 +84,16 @@ def listening(listener: Listener) -> Iterator[None]:
         _LISTENERS.remove(listener)
 
 
+@contextmanager
+def unheard() -> Iterator[None]:
+    """Nobody hears what is said inside."""
+    listeners, _LISTENERS[:] = [*_LISTENERS], []
+    try:
+        yield
+    finally:
+        _LISTENERS[:] = listeners
+
+
 def say(sentence: object, error: bool = False, passing: bool = False) -> None:
     """Tell all listeners a sentence; nobody hears it where nobody listens.
 

@@ -16,7 +16,7 @@ import numpy as np
 from hood import plugins
 from hood.assets.files.guarded import check_size, guarded, listed
 from hood.assets.files.text import meant
-from hood.assets.formats.gltf_mesh import read_glb
+from hood.assets.formats.gltf import read_glb
 from hood.assets.formats.obj_off_stl import read_obj, read_off, read_stl
 from hood.assets.formats.ply import read_ply
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable

@@ -92,7 +92,7 @@ class MotionFiles(Sequence[PoseSequence]):
         lengths = []
         for name in names:
             try:
-                length = _num_frames(name, fps, file_fps) or load(name).num_frames
+                length = frames_by_header(name, fps, file_fps) or load(name).num_frames
                 if length < min_frames:
                     raise ValueError(f"{name}: {length} frames at {fps:g} fps, at least {min_frames} are needed")
             except (ValueError, OSError) as error:
@@ -234,7 +234,7 @@ _RATES = ("mocap_framerate", "mocap_frame_rate")
 _WIDTHS = (3, *(3 * count for count in WHOLE))
 
 
-def _num_frames(name: str, fps: float, file_fps: float | None) -> int | None:
+def frames_by_header(name: str, fps: float, file_fps: float | None) -> int | None:
     """Frames at ``fps`` of an AMASS archive, by its headers and ``file_fps``; None where they do not tell."""
     path = DATA_FOLDER / "motions" / f"{name}.npz"
     path = path if path.is_file() else Path(name).expanduser()

@@ -14,8 +14,7 @@ import numpy as np
 
 from hood import native
 from hood.native.arguments import COUNT, POINTER, REAL, fields
-from hood.native.build import BuildError, build
-from hood.native.libraries import CROSSING_FLAGS
+from hood.native.build import CROSSING_FLAGS, BuildError, build
 
 _SOURCE = Path(native.__file__).with_name("crossing.cpp")
 #: Rows that there is room for at first; more are asked for where these do not suffice.

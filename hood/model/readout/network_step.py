@@ -15,10 +15,9 @@ from torch import Tensor
 
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.mesh.diffusion import Diffusion, neighbours_of
 from hood.model.features import compiled
 from hood.model.features.inputs import Inputs
-from hood.model.features.local import WIDE_ROUNDS, look_local
+from hood.model.features.local import WIDE_ROUNDS, Diffusion, look_local, neighbours_of
 from hood.model.graph.builder import Graph
 from hood.model.network.model import MeshGraphNet
 from hood.native import features as native

@@ -20,9 +20,8 @@ from torch.autograd.function import once_differentiable
 
 from hood.contact.contact import Contact
 from hood.energies.problem import StepProblem, inertial_guess
-from hood.mesh.diffusion import neighbours_of
 from hood.model.features.compiled import planes_of
-from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS
+from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, neighbours_of
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass, take_passes
 from hood.native import features as native

@@ -30,8 +30,7 @@ from hood.energies.self_contact import LayerGrips
 from hood.energies.term import LAYER_FORMS, BlockForm, Form, having
 from hood.mesh.geometry import dihedral_angles
 from hood.native.arguments import COUNT, POINTER, REAL, fields
-from hood.native.build import NATIVE_FLAGS, build
-from hood.native.libraries import WIDE_FLAGS
+from hood.native.build import NATIVE_FLAGS, WIDE_FLAGS, build
 from hood.solver.compiled.tables import Tables
 from hood.solver.derivatives.compiled_vertices import whole
 from hood.solver.derivatives.elements import face_constants, hinge_constants
