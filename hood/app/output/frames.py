@@ -121,7 +121,7 @@ def stored_body(config: RolloutSettings, scene: Scene, own: Own = NAMED) -> Body
         found, frames = _at_moments(config, scene, rate.count(count), own), np.arange(rate.count(count))
         if found is None:
             raise ConfigError(
-                f"store=cloth: at output_fps={shown(config.output_fps)} the body is interpolated, which no parameters give back; "
+                f"store=cloth: at output_fps={shown(config.output_fps)} the body is interpolated, no parameters give it back; "
                 "choose store=cloth+body, or an output_fps of which fps is a multiple"
             )
         motion = found

@@ -11,7 +11,7 @@ import numpy as np
 
 from hood.assets.body.body import Body
 from hood.assets.files.guarded import own_dataset
-from hood.rollouts.file.compact import body_of, check_compact, is_compact, most_bytes, read_positions
+from hood.rollouts.file.compact import PositionTable, body_of, check_compact, compact_paths, is_compact, most_bytes
 from hood.rollouts.file.recorder import (
     ALARM_COLUMNS,
     STEP_COLUMNS,
@@ -118,7 +118,7 @@ def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
             done = _frames_there(file)
             body_tables = body_of(file, done)
             data = RolloutData(
-                cloth_pos=read_positions(file, "cloth", 0, done),
+                cloth_pos=PositionTable(file, "cloth").read(0, done),
                 cloth_faces=file["cloth/faces"][:],
                 rest_pos=file["cloth/rest_pos"][:],
                 body_pos=_NO_POS,
@@ -147,17 +147,10 @@ def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
 _NO_POS, _NO_FACES = np.zeros((0, 0, 3)), np.zeros((0, 3), dtype=np.int32)
 
 
-#: Tables that a compact file may have.
-_COMPACT = (
-    *(f"{part}/{name}" for part in ("cloth", "body") for name in ("steps", "exact_frames", "exact_pos")),
-    *(f"body/{name}" for name in ("pos", "faces", "poses", "transl", "fingers", "betas")),
-)
-
-
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
     """A table that claims more than the file holds would be read as empty memory."""
     names = ["cloth/faces", "cloth/rest_pos", "time"]
-    names += [name for name in _COMPACT if name in file] if is_compact(file) else ["cloth/pos", "body/pos", "body/faces"]
+    names += compact_paths(file) if is_compact(file) else ["cloth/pos", "body/pos", "body/faces"]
     by_frame = (*_field_paths(file), *_metric_paths(file), *step_paths(file))
     for name in (*names, *by_frame, *_alarm_paths(file), *_still_paths(file), *still_step_paths(file)):
         table = own_dataset(file, name)
