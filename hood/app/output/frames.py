@@ -131,9 +131,9 @@ def stored_body(config: RolloutSettings, scene: Scene, own: Own = NAMED) -> Body
         )
     path = Path(str(config.body)).expanduser()
     model = str(path.absolute()) if path.exists() else str(config.body)
-    sequence = motion.sequence
-    gender = config.gender or sequence.gender
-    return BodyParameters(model, gender, digest_of(motion.body), sequence.at(frames), motion.betas)
+    # The world's turn is in the translation: poses, translation and betas are all that it takes.
+    sequence = replace(motion.sequence.at(frames), transl=motion.translation[frames], world_rotation=np.eye(3))
+    return BodyParameters(model, config.gender or sequence.gender, digest_of(motion.body), sequence, motion.betas)
 
 
 def summarise_rate(data: RolloutData) -> dict[str, Any]:

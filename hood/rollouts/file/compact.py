@@ -52,7 +52,7 @@ class BodyParameters:
         model: as :func:`hood.load_body` takes it.
         gender: likewise.
         digest: of the model, see :func:`digest_of`.
-        sequence: of T frames.
+        sequence: of T frames, with the world's turn in its translation.
         betas: (S,) shape coefficients.
     """
 
@@ -298,7 +298,7 @@ def _write_parameters(file: h5py.File, body: BodyParameters, pos: np.ndarray, pa
     for name, values in tables.items():
         if values is not None:
             _write(file, name, values[: len(pos)] if name != _BETAS else values)
-    says = {"model": body.model, "digest": body.digest, "world_rotation": sequence.world_rotation, "dtype": pos.dtype.name}
+    says = {"model": body.model, "digest": body.digest, "dtype": pos.dtype.name}
     optional = {"gender": body.gender, "family": sequence.family}
     file["body"].attrs.update(says | {key: value for key, value in optional.items() if value is not None})
 
@@ -322,7 +322,7 @@ def read_parameters(file: h5py.File) -> BodyParameters | None:
         transl=tables[_TRANSL],
         fps=1.0 / float(file.attrs["dt"]),
         betas=tables[_BETAS],
-        world_rotation=np.asarray(says["world_rotation"]),
+        world_rotation=np.eye(3),
         fingers=tables.get(_FINGERS),
         gender=says.get("gender"),
         family=says.get("family"),
