@@ -10,13 +10,12 @@ import time
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
 
 from hood.energies.potential import Potential, relative_gradient
-from hood.energies.problem import StepProblem
 from hood.energies.self_contact import without_layers
 from hood.energies.term import Role, having
 from hood.native.build import BuildError
@@ -28,6 +27,9 @@ from hood.solver.system.iterate import Proceed, Progress, Unknowns, fixed_positi
 from hood.solver.system.line_search import Path, backtrack
 from hood.solver.system.linear import Directions
 from hood.solver.system.plan import ModelBuilder, SolverPlan, plan_for
+
+if TYPE_CHECKING:
+    from hood.energies.problem import StepProblem
 
 #: Forms of the solver.
 ENGINES = ("auto", "compiled", "torch")

@@ -87,6 +87,7 @@ CHOICES = {
     r"weights=NAME": "weights=quickstart model=passes",
     r"inspect FILE$": "inspect my_shirt.obj",
     r"checkpoint=…": "checkpoint=A/model.safetensors",
+    r"hood dress$": "hood dress motions=plie",
     r"refine=…ms": "refine=50ms",
     r" size=…": " size=1.1",
     r",…\]": "]",
@@ -160,7 +161,11 @@ def promised(words: Sequence[str]) -> list[str]:
         many = "/*" if re.search(r"sequence=(amass|\w+\.txt)", " ".join(words)) else ""
         return [f"{folder}{many}/{name}" for name in names]
     if command == "dress":
-        return [] if "dry_run=true" in words else [f"{output}/manifest.jsonl", f"{output}/*/*/*/*/rollout.h5"]
+        return (
+            []
+            if "dry_run=true" in words
+            else [f"{output or 'outputs/dress'}/{name}" for name in ("manifest.jsonl", "*/*/*/*/rollout.h5")]
+        )
     if command in ("inspect", "fabric") and not output:
         return []
     if command == "export":

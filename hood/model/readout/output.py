@@ -21,9 +21,9 @@ from torch.autograd.function import once_differentiable
 from hood.contact.contact import Contact
 from hood.energies.problem import StepProblem, inertial_guess
 from hood.model.features.compiled import planes_of
-from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS
+from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, neighbours_of
 from hood.model.features.normalizer import RunningNormalizer
-from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass, neighbours_of, take_passes
+from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass, take_passes
 from hood.native import features as native
 from hood.solver.vertex.cg_step import STEPS
 from hood.tensors.conjugate_gradients import Steps

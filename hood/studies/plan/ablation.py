@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,13 +24,15 @@ from hood.energies.problem import StepProblem
 from hood.evaluation.gap import REFERENCE
 from hood.mesh.closest_point.tree import forget_searches
 from hood.rollouts.loop import own_start, rest_state, simulate
-from hood.scene.body_motion.motion import Motion
 from hood.scene.scene import Scene, recentre
 from hood.solver.newton import minimize
 from hood.solver.system.iterate import in_double
 from hood.steppers.network import Prediction
-from hood.steppers.newton import Stepper
 from hood.steppers.refined import prepare_stepper
+
+if TYPE_CHECKING:
+    from hood.scene.body_motion.motion import Motion
+    from hood.steppers.newton import Stepper
 
 #: The body is posed in at most so many frames, and every so many of its vertices are looked at.
 _MOST_POSES, _VERTEX_STRIDE = 60, 16

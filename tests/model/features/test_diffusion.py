@@ -2,7 +2,7 @@
 
 import torch
 
-from hood.model.readout.network_step import Diffusion
+from hood.model.features.local import Diffusion
 
 CHAIN = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
 
