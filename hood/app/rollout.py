@@ -42,7 +42,7 @@ from hood.app.stepping.guarding import OFF, GuardStopped, guard_sentences, make_
 from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.said import Doubt
-from hood.rollouts.file.compact import BodyParameters, compact
+from hood.rollouts.file.compact import BodyParameters, make_compact
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import RolloutWriter, still_of
 from hood.rollouts.frame import Ease, Frame, measure_ease, metric_names
@@ -194,7 +194,7 @@ def _run_there(
     interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
     data = read_rollout(folder / "rollout.h5")
     if not interrupted:
-        compact(folder / "rollout.h5", str(config.store), body)
+        make_compact(folder / "rollout.h5", str(config.store), body)
     exported: Sequence[str] = []
     try:
         with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn

@@ -31,7 +31,7 @@ from hood.rollouts.file.recorder import _field_paths, _plain_error
 #: What ``store`` may say: positions as they are; the cloth alone, with the body as parameters; both in steps.
 STORES = FULL, CLOTH, BOTH = "full", "cloth", "cloth+body"
 #: Length of a step [m]. A coordinate is off by half of it at most, a vertex by less than all of it.
-STEP = 1e-5
+POSITION_STEP = 1e-5
 #: Frames of a chunk: more make smaller files, and single frames slower to read.
 _FRAMES = 8
 #: Steps from the origin beyond this do not fit.
@@ -114,7 +114,7 @@ def _has(file: h5py.File, name: str) -> bool:
     return group is not None and group.get(table, getlink=True) is not None
 
 
-def compact(path: Path, store: str, body: BodyParameters | None) -> None:
+def make_compact(path: Path, store: str, body: BodyParameters | None) -> None:
     """Give the finished rollout in the file ``path`` the layout ``store``, at once for whoever reads it.
 
     Args:
@@ -132,7 +132,7 @@ def compact(path: Path, store: str, body: BodyParameters | None) -> None:
         with h5py.File(path, "r") as source, h5py.File(temporary, "w") as target:
             done = int(source.attrs["num_frames"])
             target.attrs.update(source.attrs)
-            target.attrs.update({"store": store, "position_error": STEP})
+            target.attrs.update({"store": store, "position_error": POSITION_STEP})
             _write_steps(target, "cloth", source["cloth/pos"][:done])
             if not source["body/pos"].shape[1]:
                 _copy(source, target, ("body/pos", "body/faces"))
@@ -183,7 +183,7 @@ def _write_steps(file: h5py.File, part: str, pos: np.ndarray) -> None:
     exact = ~(np.isfinite(pos).all(axis=(1, 2)))
     known = pos[~exact]
     origin = known[0].astype(np.float64).mean(axis=0) if len(known) and known.shape[1] else np.zeros(3)
-    steps = np.rint((pos.astype(np.float64) - origin) / STEP)
+    steps = np.rint((pos.astype(np.float64) - origin) / POSITION_STEP)
     with np.errstate(invalid="ignore"):
         exact |= ~(np.abs(steps) < _FARTHEST).all(axis=(1, 2))
     steps[exact] = 0.0
@@ -193,7 +193,7 @@ def _write_steps(file: h5py.File, part: str, pos: np.ndarray) -> None:
     table = file.create_dataset(
         f"{part}/steps", data=packed, chunks=(frames, *packed.shape[1:]), compression="gzip", compression_opts=4, shuffle=True
     )
-    table.attrs.update({"origin": origin, "step": STEP, "dtype": pos.dtype.name})
+    table.attrs.update({"origin": origin, "step": POSITION_STEP, "dtype": pos.dtype.name})
     _write(file, f"{part}/exact_frames", np.flatnonzero(exact))
     _write(file, f"{part}/exact_pos", pos[exact])
 
@@ -292,7 +292,7 @@ def _write_parameters(file: h5py.File, body: BodyParameters, pos: np.ndarray, pa
     for start in range(0, len(pos), 64):
         own = pos[start : start + 64]
         off = float(np.abs(body.surfaces(model, start, start + len(own)) - own).max(initial=0.0))
-        if not off <= STEP:
+        if not off <= POSITION_STEP:
             raise ValueError(f"{path}: its body is {1e3 * off:.3g} mm off its parameters; choose store=cloth+body")
     tables = {_POSES: sequence.poses, _TRANSL: sequence.transl, _FINGERS: sequence.fingers, _BETAS: body.betas}
     for name, values in tables.items():
@@ -330,7 +330,7 @@ def read_parameters(file: h5py.File) -> BodyParameters | None:
     return BodyParameters(str(says["model"]), says.get("gender"), str(says["digest"]), sequence, tables[_BETAS])
 
 
-def body_of(file: h5py.File, done: int) -> Callable[[Body | None], tuple[np.ndarray, np.ndarray]]:
+def body_reader(file: h5py.File, done: int) -> Callable[[Body | None], tuple[np.ndarray, np.ndarray]]:
     """Reads what the file has of the body; what comes back gives, with the model or None, ``body_pos`` (T, W, 3) [m] and its
     faces (G, 3), or raises ValueError where the model is not found."""
     parameters = read_parameters(file)

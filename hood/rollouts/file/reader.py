@@ -11,7 +11,7 @@ import numpy as np
 
 from hood.assets.body.body import Body
 from hood.assets.files.guarded import own_dataset
-from hood.rollouts.file.compact import PositionTable, body_of, check_compact, compact_paths, is_compact, most_bytes
+from hood.rollouts.file.compact import PositionTable, body_reader, check_compact, compact_paths, is_compact, most_bytes
 from hood.rollouts.file.recorder import (
     ALARM_COLUMNS,
     STEP_COLUMNS,
@@ -116,7 +116,7 @@ def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
             _check_refined(file)
             check_compact(file)
             done = _frames_there(file)
-            body_tables = body_of(file, done)
+            body_tables = body_reader(file, done)
             data = RolloutData(
                 cloth_pos=PositionTable(file, "cloth").read(0, done),
                 cloth_faces=file["cloth/faces"][:],

@@ -14,9 +14,10 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.cli.main import main
-from hood.rollouts.file.compact import BOTH, FULL, STEP, PositionTable, compact
+from hood.rollouts.file.compact import BOTH, FULL, POSITION_STEP, PositionTable, make_compact
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.file.recorder import RolloutWriter
+from hood.testing import grid
 
 FACES = np.array([[0, 1, 2], [1, 3, 2]])
 #: What makes a rollout cheap.
@@ -52,19 +53,19 @@ def test_no_vertex_is_off_by_a_step(tmp_path: Path, frames: int, far: float) -> 
     cloth, body = walk(frames, far)
     write(tmp_path / "r.h5", cloth, body)
     before = read_rollout(tmp_path / "r.h5")
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     data = read_rollout(tmp_path / "r.h5")
-    assert 0.0 < off(data.cloth_pos, cloth) < STEP
-    assert off(data.body_pos, before.body_pos) < STEP
+    assert 0.0 < off(data.cloth_pos, cloth) < POSITION_STEP
+    assert off(data.body_pos, before.body_pos) < POSITION_STEP
     assert data.cloth_pos.dtype == before.cloth_pos.dtype
     assert data.body_pos.dtype == before.body_pos.dtype
     for name in ("cloth_faces", "rest_pos", "body_faces", "time"):
         np.testing.assert_array_equal(getattr(data, name), getattr(before, name))
     np.testing.assert_array_equal(data.metrics["strain_p99"], before.metrics["strain_p99"])
     np.testing.assert_array_equal(data.fields["rg"], before.fields["rg"])
-    assert data.attributes["position_error"] == STEP
+    assert data.attributes["position_error"] == POSITION_STEP
     assert data.attributes["store"] == BOTH
-    assert {**before.attributes, "store": BOTH, "position_error": STEP} == data.attributes
+    assert {**before.attributes, "store": BOTH, "position_error": POSITION_STEP} == data.attributes
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
 
 
@@ -72,19 +73,19 @@ def test_frames_that_are_not_finite_or_very_far_come_back_as_they_were(tmp_path:
     cloth, body = walk(20)
     cloth[9, 2], cloth[15, 1, 0], cloth[18] = np.nan, np.inf, 1e30
     write(tmp_path / "r.h5", cloth, body)
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     data = read_rollout(tmp_path / "r.h5")
     for index in (9, 15, 18):
         np.testing.assert_array_equal(data.cloth_pos[index], cloth[index])
     others = [index for index in range(20) if index not in (9, 15, 18)]
-    assert off(data.cloth_pos[others], cloth[others]) < STEP
+    assert off(data.cloth_pos[others], cloth[others]) < POSITION_STEP
 
 
 def test_any_frames_are_read_as_the_whole(tmp_path: Path) -> None:
     cloth, body = walk(19)
     cloth[10] = np.nan
     write(tmp_path / "r.h5", cloth, body)
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     whole = read_rollout(tmp_path / "r.h5").cloth_pos
     with h5py.File(tmp_path / "r.h5") as file:
         table = PositionTable(file, "cloth")
@@ -99,7 +100,7 @@ def test_a_rollout_that_ended_early_stays_so(tmp_path: Path) -> None:
     for own, under in zip(cloth, body, strict=True):
         target.append(own, under, {})
     target.close(complete=False)
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     data = read_rollout(tmp_path / "r.h5")
     assert len(data.cloth_pos) == len(data.time) == 5
     assert not data.attributes["complete"]
@@ -115,7 +116,7 @@ def test_a_full_disk_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(os, "fsync", refuse)
     with pytest.raises(OSError, match=r"No space left on device.*r\.h5"):
-        compact(tmp_path / "r.h5", BOTH, None)
+        make_compact(tmp_path / "r.h5", BOTH, None)
     assert (tmp_path / "r.h5").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
 
@@ -133,7 +134,7 @@ def test_tables_that_do_not_belong_together_are_refused(tmp_path: Path, harm: ob
     cloth, body = walk(9)
     cloth[3] = np.nan
     write(tmp_path / "r.h5", cloth, body)
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     with h5py.File(tmp_path / "r.h5", "a") as file:
         harm(file)  # type: ignore[operator]
     with pytest.raises(ValueError, match=rf"r\.h5: not a rollout file \(.*{told}"):
@@ -143,7 +144,7 @@ def test_tables_that_do_not_belong_together_are_refused(tmp_path: Path, harm: ob
 def test_a_table_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:
     cloth, body = walk(9)
     write(tmp_path / "r.h5", cloth, body)
-    compact(tmp_path / "r.h5", BOTH, None)
+    make_compact(tmp_path / "r.h5", BOTH, None)
     with h5py.File(tmp_path / "r.h5", "a") as file:
         says = dict(file["cloth/steps"].attrs)
         del file["cloth/steps"]
@@ -173,9 +174,9 @@ def test_the_body_comes_back_from_its_parameters(here: Path, rate: list[str]) ->
     full, cloth, both = (read_rollout(Path(store) / "rollout.h5") for store in ("full", "cloth", "cloth+body"))
     assert len(cloth.body_pos) == len(full.body_pos)
     assert off(cloth.body_pos, full.body_pos) < 1e-6
-    assert off(both.body_pos, full.body_pos) < STEP
+    assert off(both.body_pos, full.body_pos) < POSITION_STEP
     np.testing.assert_array_equal(cloth.body_faces, full.body_faces)
-    assert off(cloth.cloth_pos, full.cloth_pos) < STEP
+    assert off(cloth.cloth_pos, full.cloth_pos) < POSITION_STEP
     sizes = [os.path.getsize(Path(store) / "rollout.h5") for store in ("cloth", "cloth+body", "full")]
     assert sizes == sorted(sizes)
     assert 6 * sizes[0] < sizes[2]
@@ -201,12 +202,15 @@ def test_another_body_model_is_refused_and_the_own_can_be_given(here: Path) -> N
 
 
 def test_a_mesh_body_is_refused_before_anything_is_written(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    roll("full", "blend_in=3", "sequence=stand")
-    assert roll("refused", "store=cloth", "body=full/rollout.h5") == 2
+    pos, faces = grid(6, 6)
+    lines = [f"v {x} {y + 2.5} {z}" for x, y, z in pos] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    Path("sheet.obj").write_text("\n".join(lines))
+    roll("full", "garment=sheet.obj", "worn=false")
+    assert roll("refused", "store=cloth", "body=full/rollout.h5", "garment=sheet.obj") == 2
     assert "full/rollout.h5 is a mesh, which no parameters give back; choose store=cloth+body" in capsys.readouterr().err
     assert not Path("refused").exists()
-    roll("both", "store=cloth+body", "body=full/rollout.h5")
-    assert off(read_rollout("both/rollout.h5").body_pos, read_rollout("full/rollout.h5").body_pos) < STEP
+    roll("both", "store=cloth+body", "body=full/rollout.h5", "garment=sheet.obj", "worn=false")
+    assert off(read_rollout("both/rollout.h5").body_pos, read_rollout("full/rollout.h5").body_pos) < POSITION_STEP
 
 
 def test_another_word_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 import hood
 from hood.cli.main import main
-from hood.rollouts.file.compact import BOTH, STEP, compact
+from hood.rollouts.file.compact import BOTH, POSITION_STEP, make_compact
 from hood.rollouts.file.dataset import RolloutDataset
 from hood.rollouts.file.recorder import RolloutWriter
 
@@ -48,7 +48,7 @@ def folder(tmp_path: Path) -> Path:
             write(tmp_path / name / "rollout.h5", 10 + index, 100.0 * index)
             line |= {"stored_frames": 10 + index} if index != 5 else {}
         lines.append(json.dumps(line))
-    compact(tmp_path / "shirt" / "walk1" / "rollout.h5", BOTH, None)
+    make_compact(tmp_path / "shirt" / "walk1" / "rollout.h5", BOTH, None)
     lines.insert(0, json.dumps({"row": "dress/walk0", "verdict": "failed"}))  # it was made again later
     (tmp_path / "manifest.jsonl").write_text("\n".join(lines) + '\n{"row": "cut o')
     return tmp_path
@@ -65,7 +65,7 @@ def test_items_are_windows_of_frames(folder: Path) -> None:
         true = np.array([at((0.0, 100.0, 500.0)[rollout], t) for t in range(frame - 1, frame + 3)])
         assert item["cloth_pos"].shape == item["cloth_vel"].shape == (3, 4, 3)
         assert item["body_pos"].shape == (3, 3, 3)
-        error = STEP if rollout == 1 else 1e-12
+        error = POSITION_STEP if rollout == 1 else 1e-12
         np.testing.assert_allclose(item["cloth_pos"][:, 0, 0], true[1:], rtol=0, atol=error)
         np.testing.assert_allclose(item["cloth_vel"][:, 3, 2], np.diff(true) / DT, rtol=0, atol=2 * error / DT)
         np.testing.assert_allclose(item["body_pos"][:, 1, 1], -true[1:], rtol=0, atol=5e-5)
