@@ -110,6 +110,7 @@ def test_few_files_stay_open(folder: Path) -> None:
     assert len(data._files) == 1
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where the tests have one processor
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers_read_what_one_process_reads(folder: Path, method: str) -> None:
     if method not in multiprocessing.get_all_start_methods():
