@@ -37,6 +37,8 @@ MODULES = {
     "hood/model/features/groups.py": "one class a feature group of the paper",
     "hood/model/readout/output.py": "one class an output; all integrate and correct in the same way",
     "hood/rollouts/checks/guard.py": "what the guard measures, its alarms and its repair decide together",
+    "hood/rollouts/file/compact.py": "one layout: positions in steps, the body as parameters, how both are written and read",
+    "hood/rollouts/file/dataset.py": "one class: its arguments, its items, its files in every worker",
     "hood/rollouts/file/recorder.py": "the writer of `rollout.h5` and the layout that it shares with the reader",
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",

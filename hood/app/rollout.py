@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from hood.app.batch.batch import (
@@ -27,7 +26,7 @@ from hood.app.batch.batch import (
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier
-from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still
+from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
@@ -43,10 +42,10 @@ from hood.app.stepping.guarding import OFF, GuardStopped, guard_sentences, make_
 from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.said import Doubt
-from hood.rollouts.checks.fit import Ease, measure_ease
+from hood.rollouts.file.compact import BodyParameters, make_compact
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import RolloutWriter, still_of
-from hood.rollouts.frame import Frame, metric_names
+from hood.rollouts.frame import Ease, Frame, measure_ease, metric_names
 from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
 from hood.rollouts.loop import simulate
 from hood.scene.sizing import Sizes
@@ -164,34 +163,38 @@ def _keep_plan(config: RolloutSettings, folder: Path) -> None:
         write_atomically(here, path.read_bytes())
 
 
-def _first_positions(path: Path, count: int) -> np.ndarray:
-    """Where the ``count`` simulated vertices of a rollout file are in frame 0, (V, 3) float64 [m], world."""
-    with h5py.File(path, "r") as file:
-        return np.asarray(file["cloth/pos"][0, :count], dtype=np.float64)
-
-
 def _run_heard(
     config: RolloutSettings, stepper: Stepper, digest: str, warned: Heard, bar: Bar, alone: bool, folder: Path
 ) -> tuple[dict[str, Any], bool]:
     """The rollout of one motion; ``warned`` is what has been warned about when the summary is written."""
     ready = set_up(config, stepper)
     check_worn(read_textures(config), ready.scene.garment)
+    body = stored_body(ready.config, ready.scene)
     with occupy(prepare_folder(folder)):
         if not alone:
             refuse_others(folder, str(config.sequence))
-        return _run_there(ready, config, digest, warned, bar, alone, folder)
+        return _run_there(ready, config, digest, warned, bar, alone, folder, body)
 
 
 def _run_there(
-    ready: Setup, asked: RolloutSettings, digest: str, warned: Heard, bar: Bar, advise: bool, folder: Path
+    ready: Setup,
+    asked: RolloutSettings,
+    digest: str,
+    warned: Heard,
+    bar: Bar,
+    advise: bool,
+    folder: Path,
+    body: BodyParameters | None,
 ) -> tuple[dict[str, Any], bool]:
-    """The rollout in its folder, which is there and held."""
+    """The rollout in its folder, which is there and held; ``body`` gives the body back where it is not stored."""
     config = ready.config
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
     interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
     data = read_rollout(folder / "rollout.h5")
+    if not interrupted:
+        make_compact(folder / "rollout.h5", str(config.store), body)
     exported: Sequence[str] = []
     try:
         with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn
@@ -228,7 +231,7 @@ def _conclude(
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:
-        _tell(advice(config, scene, summary, _first_positions(folder / "rollout.h5", scene.cloth.num_vertices)))
+        _tell(advice(config, scene, summary, data.cloth_pos[0, : scene.cloth.num_vertices].astype(np.float64)))
     summary["kernels"] = None if simulator is None else simulator.network.kernels
     return summary
 

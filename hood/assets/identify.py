@@ -112,4 +112,5 @@ def _archive_keys(path: Path) -> list[str]:
 def _h5_kind(path: Path) -> str:
     with h5py.File(path, "r") as file:
         cloth = own_group(file, "cloth")
-        return ROLLOUT if cloth is not None and cloth.get("pos", getlink=True) is not None else MOVING_MESH
+        known = cloth is not None and any(cloth.get(name, getlink=True) is not None for name in ("pos", "steps"))
+        return ROLLOUT if known else MOVING_MESH

@@ -22,9 +22,9 @@ from hood.assets.files.atomic import write_atomically
 from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
-from hood.rollouts.checks.fit import Ease, measure_ease
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import still_of
+from hood.rollouts.frame import Ease, measure_ease
 from hood.rollouts.loop import simulate
 from hood.steppers.newton import Stepper
 

@@ -32,7 +32,7 @@ def chord_error(cloth: Cloth, contact: Contact, pos: Tensor) -> Tensor:
     An edge that is stretched sags farther. What its square has grown by, beyond the quarter that the half more in
     :data:`SAG_SHARE` covers (:data:`COVERED`), is added to L², of the edge at the vertex that has grown most; no
     more than :data:`MOST_STRETCHED`, since cloth that is held farther off is stretched the more. Where a step has shown that it
-    takes more (:mod:`hood.contact.post_step`), that is added.
+    takes more (:mod:`hood.contact.further`), that is added.
 
     Args:
         pos: (V, 3) m, of the cloth at t.

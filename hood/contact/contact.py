@@ -54,7 +54,7 @@ class Contact:
     next_point: Tensor  # (V, 3) m, the same material point at t + 1
     next_normal: Tensor  # (V, 3) outward unit normal there at t + 1
     curvature: Tensor  # (V,) 1/m, of the body there at t, see hood.mesh.geometry
-    #: (V,) m, how much farther off vertices are held, see hood.contact.post_step.
+    #: (V,) m, how much farther off vertices are held, see hood.contact.further.
     raised: Tensor | None = field(default=None, kw_only=True)
 
     @property

@@ -10,9 +10,8 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
 from hood.contact.contact import Contact, SecondContact, find_contact
-from hood.contact.post_step import find_entered, hold_off, num_in_skin, signed_distance
+from hood.contact.further import find_entered, find_second_side, hold_off, num_in_skin, signed_distance
 from hood.contact.sample_points import PointContact, find_point_contact
-from hood.contact.second_side import find_second_side
 from hood.contact.self_contact import LayerPairs, SceneLayers, find_layers, find_sides, late_targets
 from hood.tensors.dense import sum_scenes
 

@@ -97,7 +97,7 @@ def find_equilibrium(
     swings; contact and friction are those of ``potential`` at the start of each step. Friction of the potential creeps below
     its slip speed (:class:`hood.energies.friction.LaggedFriction`), so that cloth on a slope never stands quite still: at rest
     is what moves by less than a millimetre in a second. Where triangles then lie in the skin, their corners are held farther
-    off (:mod:`hood.contact.post_step`). A garment that does not come to rest is warned about and is kept where it is then; of
+    off (:mod:`hood.contact.further`). A garment that does not come to rest is warned about and is kept where it is then; of
     one that has come off the body, the start is kept; other parts settle without it. Sheets that are not worn
     (:func:`hood.scene.worn.worn_vertices`) stay as they are given. There is no equilibrium :func:`without_hold`.
 

@@ -1,4 +1,4 @@
-"""Minima that are found again with cloth held farther off, where they leave it in the skin (:mod:`hood.contact.post_step`)."""
+"""Minima that are found again with cloth held farther off, where they leave it in the skin (:mod:`hood.contact.further`)."""
 
 from __future__ import annotations
 

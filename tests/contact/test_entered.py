@@ -12,7 +12,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import State, StepInput, concatenate_obstacles
 from hood.contact.contact import find_contact
-from hood.contact.post_step import signed_distance
+from hood.contact.further import signed_distance
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.closest_point import tree

@@ -11,7 +11,7 @@ from corners import obstacle
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import State, StepInput, concatenate_obstacles
-from hood.contact.post_step import MOST, RISE
+from hood.contact.further import MOST, RISE
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.penetration.crossing import crossings

@@ -13,7 +13,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles
 from hood.contact.contact import find_contact, find_second_contact
-from hood.contact.second_side import find_landing, find_second_side
+from hood.contact.further import find_landing, find_second_side
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem, free_flight
 from hood.mesh.closest_point.search import build_incidence

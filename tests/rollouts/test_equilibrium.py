@@ -18,7 +18,7 @@ from hood.assets.motion.load import load_sequence
 from hood.assets.motion.mesh_sequence import MeshSequence
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.state import Attachments
-from hood.contact.post_step import CUT_SHARE
+from hood.contact.further import CUT_SHARE
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.penetration.crossing import crossings

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import torch
 
 from hood.app.batch.manifest import DOUBTFUL, FAILED, OWN_LINE, SOUND, UNJUDGED, UNSOUND, Line, Manifest, inputs_of, own_line
@@ -124,6 +125,8 @@ def _made(call: Call, row: DataRow, attempt: int) -> Line:
         stepper, weights = make_stepper(config)
         summary = roll_out_into(config, stepper, weights, silently, temporary)
         line |= _result(config, summary, weights) | _times(began, spent)
+        with h5py.File(temporary / "rollout.h5", "r") as file:
+            line["stored_frames"] = len(file["time"])
         line["bytes"] = sum(file.stat().st_size for file in temporary.rglob("*") if file.is_file())
         (temporary / OWN_LINE).write_text(json.dumps(line), encoding="utf-8")
         _put(temporary, place)

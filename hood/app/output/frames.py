@@ -1,6 +1,8 @@
 """``output_fps``: stored frames at a rate of their own, what a user says about it and how it is reported.
 
 ``refine_mesh``: stored frames on a finer mesh than the simulated one, and how that is reported.
+
+``store``: what gives the body back where it is left out.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +21,12 @@ from hood.app.scene.motion import NAMED, Own, is_blended, motion_options, perfor
 from hood.app.settings.compose import ConfigError, shown
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.mesh.editing.subdivision import Subdivision
+from hood.rollouts.file.compact import CLOTH, BodyParameters, digest_of
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, StepPlan
 from hood.rollouts.frame import Frame
 from hood.rollouts.frames import output_frames, refined_frames
+from hood.scene.body_motion.motion import BodyMotion, Motion
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 
@@ -79,18 +84,56 @@ def _watched(scene: Scene) -> list[int]:
 def _posed(config: RolloutSettings, scene: Scene, count: int, own: Own) -> Callable[[int], Tensor] | None:
     """The body at the moments of stored frames, posed by the motion itself; None where its parts are joined at simulated
     frames, so that another rate would move the joints: it is interpolated then, as the cloth is."""
-    if config.output_fps is None or config.loop != 1 or is_blended(config):
+    motion = _at_moments(config, scene, count, own)
+    if motion is None:
         return None
-    options = replace(motion_options(config), fps=float(config.output_fps), num_frames=count)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is said of the motion has been said
-        motion = perform(config, own, options, scene.motion.dtype, scene.motion.device)
 
     def surface(index: int) -> Tensor:
         origin = motion.translation[index]
         return motion.surface(index, origin).cpu().double() + torch.as_tensor(origin)
 
     return surface
+
+
+def _at_moments(config: RolloutSettings, scene: Scene, count: int, own: Own) -> Motion | None:
+    """The motion, whose frames are the stored ones; None as :func:`_posed`."""
+    if config.output_fps is None or config.loop != 1 or is_blended(config):
+        return None
+    options = replace(motion_options(config), fps=float(config.output_fps), num_frames=count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is said of the motion has been said
+        return perform(config, own, options, scene.motion.dtype, scene.motion.device)
+
+
+def stored_body(config: RolloutSettings, scene: Scene, own: Own = NAMED) -> BodyParameters | None:
+    """What gives the body of the stored frames back, for ``store=cloth``; None where it is not needed.
+
+    Raises:
+        ConfigError: nothing does; names what to choose.
+    """
+    if str(config.store) != CLOTH or not scene.motion.num_vertices:
+        return None
+    count, rate, motion = min(int(config.num_frames), scene.num_frames), output_rate(config), scene.motion
+    frames = np.arange(count)
+    if rate is not None and rate.whole:
+        frames = np.arange(rate.count(count)) * int(rate.stride)
+    elif rate is not None:
+        found, frames = _at_moments(config, scene, rate.count(count), own), np.arange(rate.count(count))
+        if found is None:
+            raise ConfigError(
+                f"store=cloth: at output_fps={shown(config.output_fps)} the body is interpolated, no parameters give it back; "
+                "choose store=cloth+body, or an output_fps of which fps is a multiple"
+            )
+        motion = found
+    if not isinstance(motion, BodyMotion):
+        raise ConfigError(
+            f"store=cloth: body={shown(config.body)} is a mesh, which no parameters give back; choose store=cloth+body"
+        )
+    path = Path(str(config.body)).expanduser()
+    model = str(path.absolute()) if path.exists() else str(config.body)
+    # The world's turn is in the translation: poses, translation and betas are all that it takes.
+    sequence = replace(motion.sequence.at(frames), transl=motion.translation[frames], world_rotation=np.eye(3))
+    return BodyParameters(model, config.gender or sequence.gender, digest_of(motion.body), sequence, motion.betas)
 
 
 def summarise_rate(data: RolloutData) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from hood.assets.garment.parts import tailored
 from hood.assets.garment.pins import pin_mask
 from hood.assets.garment.record import Wanted
 from hood.mesh.editing.repair import FLAT
-from hood.rollouts.checks.fit import Ease
+from hood.rollouts.frame import Ease
 from hood.scene.body_motion.motion import BodyMotion, Motion
 from hood.scene.sizing import Sizes, sizes_of
 

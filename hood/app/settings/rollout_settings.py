@@ -84,6 +84,7 @@ class RolloutSettings(Mapping[str, Any]):
     video: Any
     sheet: bool
     refine_mesh: int
+    store: str
     formats: ListConfig
 
     @classmethod

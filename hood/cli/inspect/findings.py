@@ -309,7 +309,9 @@ def inspect_rollout(name: str) -> Finding:
         "cloth vertices": data.cloth_pos.shape[1],
         "body vertices": data.body_pos.shape[1],
         **{
-            key: str(data.attributes[key]) for key in ("garment", "sequence", "checkpoint", "stepper") if key in data.attributes
+            key: str(data.attributes[key])
+            for key in ("garment", "sequence", "checkpoint", "stepper", "store")
+            if key in data.attributes
         },
     }
     if data.refined is not None:

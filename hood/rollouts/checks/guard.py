@@ -17,11 +17,11 @@ Of every step the gravest of these causes is told, and of the surface what is me
   far, or hardly lets it stretch. Ten iterations suffice: on 14 steps of ``ours`` and 14 of quickstart (dress and shorts on
   dance_mixed) they come within 0.4 points of 200, where the steps themselves are up to 12 points off (quickstart: 0.4).
 - *inside*: a vertex is more than 10 mm inside the body. It is mended with contact where it has got to
-  (:mod:`hood.contact.post_step`); a solver has tried that already.
+  (:mod:`hood.contact.further`); a solver has tried that already.
 - *turn*, *speed*: the body turns by more than 15 degrees as one, or its fastest vertex moves by more than 0.3 m. A jump over
   which the cloth was carried is none.
 - *cut*: the skin cuts more than 2% of the cloth's triangles, where that is measured. Of a network or a refinement ``repair``
-  looks at every step, and holds cloth farther off (:mod:`hood.contact.post_step`) where more than 0.5% are in the skin.
+  looks at every step, and holds cloth farther off (:mod:`hood.contact.further`) where more than 0.5% are in the skin.
 
 The limits come from the validation list: seven garments of 1,000 vertices on walk_proud, dance_mixed, plie and
 twist_and_bend, 60 frames each (``python benchmarks/guard.py``; quickstart 1,475 steps, quickstart+5 1,357, newton 1,652, ours
@@ -53,7 +53,7 @@ from statistics import median
 import torch
 
 from hood.cloth.state import Obstacle
-from hood.contact.post_step import CUT_SHARE
+from hood.contact.further import CUT_SHARE
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.limits import CUT_ALARM, INSIDE_ALARM, STRAIN_ALARM, STRAIN_RATIO

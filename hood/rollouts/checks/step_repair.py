@@ -125,7 +125,7 @@ def repair_step(
 def out_of_skin(
     potential: Potential, problem: StepProblem, prediction: Prediction, strain: float, settings: NewtonSettings
 ) -> RepairedStep | None:
-    """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.contact.post_step`);
+    """The step with its cloth held farther off where it leaves too many triangles in the skin (:mod:`hood.contact.further`);
     left as it was where that does not help or strains it beyond ``strain`` (99th percentile); None where it leaves few."""
     pos = prediction.next_pos
     if prediction.entered is not None:

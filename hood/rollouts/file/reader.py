@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from hood.assets.body.body import Body
 from hood.assets.files.guarded import own_dataset
+from hood.rollouts.file.compact import PositionTable, body_reader, check_compact, compact_paths, is_compact, most_bytes
 from hood.rollouts.file.recorder import (
     ALARM_COLUMNS,
     STEP_COLUMNS,
@@ -81,20 +83,22 @@ class RolloutData:
         return self.cloth_pos[:, vertices] if self.steps is None else self.steps.pos_of(vertices)
 
 
-def read_rollout(path: Path | str) -> RolloutData:
+def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
     """Read ``rollout.h5``, also one that is being written, whose frames so far it returns, or whose writer was killed.
 
     How many frames the whole is to have is the attribute ``num_planned``, whether it is finished ``complete``.
 
     Args:
-        path: the file ``rollout.h5``.
+        path: the file ``rollout.h5``, of any ``store``.
+        body: the model of the body, where the file has the body as parameters (``store=cloth``); None: that of the name or file
+            which the rollout was made with.
 
     Returns:
         The :class:`RolloutData`, with ``cloth_pos`` (T, V, 3) m, ``body_pos`` (T, W, 3) m and ``time`` (T,) s.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a rollout file.
+        ValueError: not a rollout file, or a body model that is not found.
 
     Examples:
         >>> import hood
@@ -110,13 +114,15 @@ def read_rollout(path: Path | str) -> RolloutData:
             _check_extents(file, path.stat().st_size)
             _check_riding(file)
             _check_refined(file)
+            check_compact(file)
             done = _frames_there(file)
-            return RolloutData(
-                cloth_pos=file["cloth/pos"][:done],
+            body_tables = body_reader(file, done)
+            data = RolloutData(
+                cloth_pos=PositionTable(file, "cloth").read(0, done),
                 cloth_faces=file["cloth/faces"][:],
                 rest_pos=file["cloth/rest_pos"][:],
-                body_pos=file["body/pos"][:done],
-                body_faces=file["body/faces"][:],
+                body_pos=_NO_POS,
+                body_faces=_NO_FACES,
                 time=file["time"][:done],
                 metrics={name.removeprefix("metrics/"): file[name][:done] for name in _metric_paths(file)},
                 attributes=dict(file.attrs),
@@ -130,15 +136,25 @@ def read_rollout(path: Path | str) -> RolloutData:
     except Exception as error:  # damaged files make h5py raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: not a rollout file ({reason}); make one with hood rollout") from error
+    try:
+        body_pos, body_faces = body_tables(body)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return replace(data, body_pos=body_pos, body_faces=body_faces)
+
+
+#: Until the body is there.
+_NO_POS, _NO_FACES = np.zeros((0, 0, 3)), np.zeros((0, 3), dtype=np.int32)
 
 
 def _check_extents(file: h5py.File, num_bytes: int) -> None:
-    """Rollouts are stored as they are: a table that claims more than the file holds would be read as empty memory."""
-    names = ("cloth/pos", "cloth/faces", "cloth/rest_pos", "body/pos", "body/faces", "time")
+    """A table that claims more than the file holds would be read as empty memory."""
+    names = ["cloth/faces", "cloth/rest_pos", "time"]
+    names += compact_paths(file) if is_compact(file) else ["cloth/pos", "body/pos", "body/faces"]
     by_frame = (*_field_paths(file), *_metric_paths(file), *step_paths(file))
     for name in (*names, *by_frame, *_alarm_paths(file), *_still_paths(file), *still_step_paths(file)):
         table = own_dataset(file, name)
-        if not table.shape or table.size * table.dtype.itemsize > num_bytes:
+        if not table.shape or table.size * table.dtype.itemsize > most_bytes(table, num_bytes):
             raise ValueError(f"{name} claims the shape {table.shape}, the file has {num_bytes} bytes")
 
 

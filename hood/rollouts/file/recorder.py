@@ -244,7 +244,7 @@ class RolloutWriter:
 def _frames_there(file: h5py.File) -> int:
     """Frames done. A network disk may show the count before the values: what is still NaN as laid out is not counted."""
     done = min(int(file.attrs["num_frames"]), len(file["time"]))
-    if not bool(file.attrs.get("complete", False)):
+    if not bool(file.attrs.get("complete", False)) and "cloth/pos" in file:  # else it was written at once
         while done > 0 and not _is_there(file, done - 1):
             done -= 1
     return max(done, 0)

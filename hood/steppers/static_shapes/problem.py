@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hood.cloth.state import Attachments, Obstacle, State
 from hood.contact.contact import SecondContact, find_contact, find_fixed_contact, find_static_second_contact
-from hood.contact.second_side import find_second_side
+from hood.contact.further import find_second_side
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, free_flight
 from hood.energies.term import Energy, prepared

@@ -14,7 +14,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import lengths_of
 from hood.energies.damping import BendDamping, StretchDamping
 from hood.energies.wind import Wind
-from hood.rollouts.checks.fit import Ease
+from hood.rollouts.frame import Ease
 from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.scene import dress
 from hood.scene.sizing import Sizes

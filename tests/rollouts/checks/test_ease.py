@@ -10,7 +10,7 @@ import torch
 from hood.cloth.state import Obstacle, State
 from hood.contact.contact import find_contact
 from hood.energies.potential import default_potential
-from hood.rollouts.checks.fit import FALLS_OFF, FITS, IS_TIGHT, measure_ease
+from hood.rollouts.frame import FALLS_OFF, FITS, IS_TIGHT, measure_ease
 from hood.rollouts.loop import simulate
 from hood.scene.scene import Scene
 from hood.scene.sizing import resized, sizes_of

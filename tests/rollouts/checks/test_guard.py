@@ -15,7 +15,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.contact.contact import find_contact
-from hood.contact.post_step import CUT_SHARE
+from hood.contact.further import CUT_SHARE
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.rollouts.checks import guard as guard_module
