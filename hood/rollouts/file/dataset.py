@@ -119,7 +119,7 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         velocities: bool = False,
         body: str = "none",
         dtype: torch.dtype = torch.float32,
-        open_files: int = 32,
+        open_files: int = 128,
     ) -> None:
         for name, value in (("window", window), ("stride", stride), ("open_files", open_files)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -228,8 +228,8 @@ class RolloutDataset(Dataset[dict[str, Any]]):
             self._files.move_to_end(number)
             return self._files[number]
         source = self._sources[number]
-        opened = _opened(source)
-        self._files[number] = opened
+        opened = _opened(source, self._same.get(number))
+        self._files[number], self._same[number] = opened, opened.same
         while len(self._files) > self._most:
             self._files.popitem(last=False)[1].file.close()
         return opened
@@ -239,23 +239,30 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         self._files: OrderedDict[int, _Opened] = OrderedDict()
         self._unpacked: OrderedDict[tuple[int, str, int], np.ndarray] = OrderedDict()
         self._meshes: dict[bytes, ClothMesh] = {}
+        self._same: dict[int, dict[str, Any]] = {}  # of files that were open before
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("_files", "_unpacked", "_meshes")}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_files", "_unpacked", "_meshes", "_same")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._forget()
 
 
-def _opened(source: _Source) -> _Opened:
-    """A rollout, open for reading. Raises FileNotFoundError, ValueError: there is none, or another one now."""
+def _opened(source: _Source, known: dict[str, Any] | None = None) -> _Opened:
+    """A rollout, open for reading; ``known`` is what was read of it before.
+
+    Raises:
+        FileNotFoundError, ValueError: there is none, or another one now.
+    """
     if not source.path.is_file():
         raise FileNotFoundError(f"{source.path}: no such file; give the folders that hood dress or hood rollout wrote")
     try:
-        file = h5py.File(source.path, "r")
+        file = h5py.File(source.path, "r", rdcc_nbytes=0)  # chunks are read whole, and kept unpacked
     except OSError as error:
         raise ValueError(f"{source.path}: not a rollout file ({error}); make one with hood rollout") from error
+    if known is not None:
+        return _Opened(file, known)
     try:
         frames = min(int(file.attrs["num_frames"]), len(file["time"]))
         material = json.loads(file.attrs.get("material", "{}"))
