@@ -25,7 +25,7 @@ from hood.app.batch.batch import (
 )
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
-from hood.app.output.export import check_outputs, check_worn, export_beside, lay_on, read_textures, remove_earlier
+from hood.app.output.export import check_outputs, check_worn, export_beside, forms_beside, lay_on, read_textures, remove_earlier
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
@@ -42,7 +42,7 @@ from hood.app.stepping.guarding import OFF, GuardStopped, guard_sentences, make_
 from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.said import Doubt
-from hood.rollouts.file.compact import BodyParameters, make_compact
+from hood.rollouts.file.compact import BodyParameters, make_compact, store_of
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import RolloutWriter, still_of
 from hood.rollouts.frame import Ease, Frame, measure_ease, metric_names
@@ -194,14 +194,14 @@ def _run_there(
     interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
     data = read_rollout(folder / "rollout.h5")
     if not interrupted:
-        make_compact(folder / "rollout.h5", str(config.store), body)
+        make_compact(folder / "rollout.h5", store_of(config.formats), body)
     exported: Sequence[str] = []
     try:
         with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn
             judged = beside.submit(summarise, data)
             if not interrupted:
                 _draw(config, data, folder, bar)
-                exported = export_beside(folder / "rollout.h5", [str(form) for form in config.formats], read_textures(config))
+                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config))
     finally:
         summary = _conclude(ready, folder, data, judged.result(), eases, advise)
         summary["warnings"] = list(warned)

@@ -31,7 +31,6 @@ from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.energies.potential import Potential
 from hood.model.kernels.block import KERNELS
-from hood.rollouts.file.compact import STORES
 from hood.rollouts.frame import METRIC_CHOICES, SETTLE_CHOICES
 from hood.rollouts.loop import own_start
 from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
@@ -65,7 +64,6 @@ def check_config(config: RolloutSettings) -> None:
     _check_metrics(config)
     start_of(config)
     require_choice(config, "fail_on", FAIL_ON)
-    require_choice(config, "store", STORES)
     _check_numbers(config)
     checked_fabrics(config)
     checked_sizes(config)

@@ -28,6 +28,7 @@ from hood.media.exports.gltf import gltf_bytes
 from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
 from hood.media.exports.usd import image_name, write_usd
 from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name
+from hood.rollouts.file.compact import STORES
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import still_of
 
@@ -72,13 +73,20 @@ def check_outputs(config: Settings) -> None:
         ConfigError: no such format, or its package is missing; or no picture and no format shows ``texture``.
         ValueError: an image cannot be used.
     """
-    forms = [str(form) for form in config.formats]
+    forms, layouts = forms_beside(config), [str(form) for form in config.formats if str(form) in STORES]
+    if len(layouts) > 1:
+        raise ConfigError(f"formats: {' and '.join(layouts)} are layouts of one file, rollout.h5; give one of them")
     for form in forms:
         _check_format(form, "formats", f"formats={forms}")
     textures = read_textures(config)
     drawn = str(config.video) != "none" or bool(config.sheet)
     if not drawn or str(config.colour) != "none":
         _check_textured(textures, forms, "formats", f"colour={config.colour} formats={forms}")
+
+
+def forms_beside(config: Settings) -> list[str]:
+    """The formats of files beside ``rollout.h5`` that ``hood rollout formats=[…]`` asks for."""
+    return [str(form) for form in config.formats if str(form) not in STORES]
 
 
 def _check_textured(textures: Mapping[str, Texture], forms: Sequence[str], key: str, asked: str) -> None:
@@ -143,7 +151,8 @@ def _check_format(form: str, key: str, asked: str) -> None:
     if form.lower() in ("abc", "alembic"):
         raise ConfigError(f"{asked}: no maintained package writes Alembic; take {key}=usd, which the same programs read")
     if form not in FORMATS:
-        raise ConfigError(f"{asked}: choose {' or '.join(FORMATS)}")
+        layouts = STORES[1:] if key == "formats" else ()
+        raise ConfigError(f"{asked}: choose {' or '.join([*FORMATS, *layouts])}")
     if form == "usd" and importlib.util.find_spec("pxr") is None:
         raise ConfigError(f"{asked}: writing needs usd-core ({install('usd')}); glb, pc2, obj and ply need nothing more")
 

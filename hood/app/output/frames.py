@@ -21,7 +21,7 @@ from hood.app.scene.motion import NAMED, Own, is_blended, motion_options, perfor
 from hood.app.settings.compose import ConfigError, shown
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.mesh.editing.subdivision import Subdivision
-from hood.rollouts.file.compact import CLOTH, BodyParameters, digest_of
+from hood.rollouts.file.compact import CLOTH, BodyParameters, digest_of, store_of
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, StepPlan
 from hood.rollouts.frame import Frame
@@ -106,12 +106,12 @@ def _at_moments(config: RolloutSettings, scene: Scene, count: int, own: Own) -> 
 
 
 def stored_body(config: RolloutSettings, scene: Scene, own: Own = NAMED) -> BodyParameters | None:
-    """What gives the body of the stored frames back, for ``store=cloth``; None where it is not needed.
+    """What gives the body of the stored frames back, for ``formats=[cloth]``; None where it is not needed.
 
     Raises:
         ConfigError: nothing does; names what to choose.
     """
-    if str(config.store) != CLOTH or not scene.motion.num_vertices:
+    if store_of(config.formats) != CLOTH or not scene.motion.num_vertices:
         return None
     count, rate, motion = min(int(config.num_frames), scene.num_frames), output_rate(config), scene.motion
     frames = np.arange(count)
@@ -121,13 +121,13 @@ def stored_body(config: RolloutSettings, scene: Scene, own: Own = NAMED) -> Body
         found, frames = _at_moments(config, scene, rate.count(count), own), np.arange(rate.count(count))
         if found is None:
             raise ConfigError(
-                f"store=cloth: at output_fps={shown(config.output_fps)} the body is interpolated, no parameters give it back; "
-                "choose store=cloth+body, or an output_fps of which fps is a multiple"
+                f"formats=[cloth]: at output_fps={shown(config.output_fps)} the body is interpolated, no parameters give it "
+                "back; choose formats=[cloth+body], or an output_fps of which fps is a multiple"
             )
         motion = found
     if not isinstance(motion, BodyMotion):
         raise ConfigError(
-            f"store=cloth: body={shown(config.body)} is a mesh, which no parameters give back; choose store=cloth+body"
+            f"formats=[cloth]: body={shown(config.body)} is a mesh, which no parameters give back; choose formats=[cloth+body]"
         )
     path = Path(str(config.body)).expanduser()
     model = str(path.absolute()) if path.exists() else str(config.body)

@@ -84,7 +84,6 @@ class RolloutSettings(Mapping[str, Any]):
     video: Any
     sheet: bool
     refine_mesh: int
-    store: str
     formats: ListConfig
 
     @classmethod

@@ -73,9 +73,7 @@ def read_vertex_h5(path: Path) -> VertexFile:
                 key: _dataset(file, key) for key in (*VERTEX_KEYS, *FACE_KEYS, *_OTHER_KEYS) if key in file
             }
             if not found.keys() & set(VERTEX_KEYS) and "store" in file.attrs:
-                raise ValueError(
-                    f"a rollout of store={file.attrs['store']}, whose body is no mesh here; make it with store=full"
-                )
+                raise ValueError(f"a rollout of formats=[{file.attrs['store']}], whose body is no mesh here; make it without")
             said = next(rates_in({key: _small(file, key) for key in file} | dict(file.attrs)), None)
             found |= {} if said is None else {"fps": said[1]}
             if "body/pos" in found and "dt" in file.attrs:

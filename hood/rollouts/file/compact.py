@@ -28,7 +28,7 @@ from hood.assets.files.guarded import own_dataset, own_group
 from hood.assets.motion.sequence import PoseSequence
 from hood.rollouts.file.recorder import _field_paths, _plain_error
 
-#: What ``store`` may say: positions as they are; the cloth alone, with the body as parameters; both in steps.
+#: What ``formats`` may say of ``rollout.h5``: positions as they are; cloth alone, the body as parameters; both in steps.
 STORES = FULL, CLOTH, BOTH = "full", "cloth", "cloth+body"
 #: Length of a step [m]. A coordinate is off by half of it at most, a vertex by less than all of it.
 POSITION_STEP = 1e-5
@@ -84,7 +84,7 @@ class BodyParameters:
         return body.surface(sequence, self.betas, torch.float64).numpy() + place[:, None]
 
 
-_GIVE = "give the model with hood.read_rollout(file, body=hood.load_body(…)); store=cloth+body keeps the body in the file"
+_GIVE = "give the model with hood.read_rollout(file, body=hood.load_body(…)); formats=[cloth+body] keeps the body in the file"
 
 
 def digest_of(body: Body) -> str:
@@ -100,6 +100,11 @@ def digest_of(body: Body) -> str:
 def _loaded(model: str, gender: str | None) -> tuple[Body, str]:
     body = load_body(model, gender)
     return body, digest_of(body)
+
+
+def store_of(forms: Iterable[object]) -> str:
+    """The layout among the words of ``formats``, the first of :data:`STORES`."""
+    return next((str(form) for form in forms if str(form) in STORES), FULL)
 
 
 def is_compact(file: h5py.File) -> bool:
@@ -293,7 +298,7 @@ def _write_parameters(file: h5py.File, body: BodyParameters, pos: np.ndarray, pa
         own = pos[start : start + 64]
         off = float(np.abs(body.surfaces(model, start, start + len(own)) - own).max(initial=0.0))
         if not off <= POSITION_STEP:
-            raise ValueError(f"{path}: its body is {1e3 * off:.3g} mm off its parameters; choose store=cloth+body")
+            raise ValueError(f"{path}: its body is {1e3 * off:.3g} mm off its parameters; choose formats=[cloth+body]")
     tables = {_POSES: sequence.poses, _TRANSL: sequence.transl, _FINGERS: sequence.fingers, _BETAS: body.betas}
     for name, values in tables.items():
         if values is not None:

@@ -79,7 +79,8 @@ class RolloutDataset(Dataset[dict[str, Any]]):
     sampler that keeps garments apart: their numbers of vertices differ.
 
     Files are opened when they are read, by every worker for itself; at most ``open_files`` stay open. The data set can be
-    pickled, and workers may be forked or spawned. Reading ``store=cloth`` or ``store=cloth+body`` unpacks eight frames at once.
+    pickled, and workers may be forked or spawned. Reading the compact layouts
+    (``formats=[cloth]``) unpacks eight frames at once.
 
     Args:
         source: the output folder of ``hood dress``, its ``manifest.jsonl``, or a list of ``rollout.h5`` files or folders.
@@ -90,7 +91,7 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         rows: patterns of names of rows, such as ``dress/*``; None: all.
         where: says of a line of the manifest whether its row is taken.
         velocities: with ``cloth_vel``; windows then begin with frame 1.
-        body: ``none``, ``pos`` or ``parameters``, which files with ``store=cloth`` have.
+        body: ``none``, ``pos`` or ``parameters``, which files with ``formats=[cloth]`` have.
         dtype: of the tensors.
         open_files: files that a process keeps open.
 
@@ -100,7 +101,7 @@ class RolloutDataset(Dataset[dict[str, Any]]):
 
     Examples:
         >>> import hood
-        >>> _ = hood.rollout(garment="tank", num_frames=4, video="none", sheet=False, store="cloth", output="outputs/small")
+        >>> _ = hood.rollout(garment="tank", num_frames=4, video="none", sheet=False, formats=["cloth"], output="outputs/small")
         >>> pairs = hood.RolloutDataset(["outputs/small"], window=2, velocities=True)
         >>> len(pairs), tuple(pairs[0]["cloth_pos"].shape)
         (2, (2, 1016, 3))

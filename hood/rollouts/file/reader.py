@@ -89,9 +89,9 @@ def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
     How many frames the whole is to have is the attribute ``num_planned``, whether it is finished ``complete``.
 
     Args:
-        path: the file ``rollout.h5``, of any ``store``.
-        body: the model of the body, where the file has the body as parameters (``store=cloth``); None: that of the name or file
-            which the rollout was made with.
+        path: the file ``rollout.h5``, of any layout.
+        body: the model of the body, where the file has the body as parameters (``formats=[cloth]``); None: that of the
+            name or file which the rollout was made with.
 
     Returns:
         The :class:`RolloutData`, with ``cloth_pos`` (T, V, 3) m, ``body_pos`` (T, W, 3) m and ``time`` (T,) s.

@@ -170,7 +170,7 @@ def roll(folder: str, *words: str) -> int:
 @pytest.mark.parametrize("rate", [[], ["fps=60", "output_fps=30"], ["fps=30", "output_fps=24"]], ids=["every", "second", "24"])
 def test_the_body_comes_back_from_its_parameters(here: Path, rate: list[str]) -> None:
     for store in ("full", "cloth", "cloth+body"):
-        roll(store, f"store={store}", "betas=[1.5]", *rate)
+        roll(store, f"formats=[{store}]", "betas=[1.5]", *rate)
     full, cloth, both = (read_rollout(Path(store) / "rollout.h5") for store in ("full", "cloth", "cloth+body"))
     assert len(cloth.body_pos) == len(full.body_pos)
     assert off(cloth.body_pos, full.body_pos) < 1e-6
@@ -183,12 +183,12 @@ def test_the_body_comes_back_from_its_parameters(here: Path, rate: list[str]) ->
 
 
 def test_without_a_body_there_is_none(here: Path) -> None:
-    roll("bare", "store=cloth", "body=none", "pins=[0]")
+    roll("bare", "formats=[cloth]", "body=none", "pins=[0]")
     assert read_rollout("bare/rollout.h5").body_pos.shape == (12, 0, 3)
 
 
 def test_another_body_model_is_refused_and_the_own_can_be_given(here: Path) -> None:
-    roll("out", "store=cloth")
+    roll("out", "formats=[cloth]")
     path = Path("out/rollout.h5")
     with h5py.File(path, "a") as file:
         file["body"].attrs["model"] = "gone.npz"
@@ -206,16 +206,18 @@ def test_a_mesh_body_is_refused_before_anything_is_written(here: Path, capsys: p
     lines = [f"v {x} {y + 2.5} {z}" for x, y, z in pos] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
     Path("sheet.obj").write_text("\n".join(lines))
     roll("full", "garment=sheet.obj", "worn=false")
-    assert roll("refused", "store=cloth", "body=full/rollout.h5", "garment=sheet.obj") == 2
-    assert "full/rollout.h5 is a mesh, which no parameters give back; choose store=cloth+body" in capsys.readouterr().err
+    assert roll("refused", "formats=[cloth]", "body=full/rollout.h5", "garment=sheet.obj") == 2
+    assert "full/rollout.h5 is a mesh, which no parameters give back; choose formats=[cloth+body]" in capsys.readouterr().err
     assert not Path("refused").exists()
-    roll("both", "store=cloth+body", "body=full/rollout.h5", "garment=sheet.obj", "worn=false")
+    roll("both", "formats=[cloth+body]", "body=full/rollout.h5", "garment=sheet.obj", "worn=false")
     assert off(read_rollout("both/rollout.h5").body_pos, read_rollout("full/rollout.h5").body_pos) < POSITION_STEP
 
 
 def test_another_word_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert roll("out", "store=cloths") == 2
-    assert "known are full, cloth, cloth+body" in capsys.readouterr().err
+    assert roll("out", "formats=[cloth,cloth+body]") == 2
+    assert "are layouts of one file" in capsys.readouterr().err
+    assert roll("out", "formats=[cloths]") == 2
+    assert "cloth or cloth+body" in capsys.readouterr().err
 
 
 def test_an_interrupted_rollout_keeps_the_layout_that_it_was_written_in(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,24 +229,24 @@ def test_an_interrupted_rollout_keeps_the_layout_that_it_was_written_in(here: Pa
         whole(self, *given)  # type: ignore[arg-type]
 
     monkeypatch.setattr(RolloutWriter, "append", interrupted)
-    assert roll("out", "store=cloth") == 130
+    assert roll("out", "formats=[cloth]") == 130
     with h5py.File("out/rollout.h5") as file:
         assert file["cloth/pos"].shape[0] == 5
         assert "store" not in file.attrs
 
 
 def test_resume_keeps_what_is_there_and_makes_another_layout_again(here: Path) -> None:
-    roll("out", "store=cloth")
+    roll("out", "formats=[cloth]")
     first = Path("out/rollout.h5").stat().st_mtime_ns
-    roll("out", "store=cloth", "resume=true")
+    roll("out", "formats=[cloth]", "resume=true")
     assert Path("out/rollout.h5").stat().st_mtime_ns == first
-    roll("out", f"store={FULL}", "resume=true")
+    roll("out", f"formats=[{FULL}]", "resume=true")
     with h5py.File("out/rollout.h5") as file:
         assert "cloth/pos" in file
 
 
 def test_commands_read_compact_rollouts(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    roll("out", "store=cloth", "formats=[glb]", "garment=tank")
+    roll("out", "formats=[cloth,glb]", "garment=tank")
     assert list(Path("out").glob("*.glb"))
     assert main(["inspect", "out"]) in (0, 1)
     told = capsys.readouterr().out
@@ -253,5 +255,5 @@ def test_commands_read_compact_rollouts(here: Path, capsys: pytest.CaptureFixtur
     assert main(["export", "out", "format=obj", "num_frames=2", "output=obj"]) == 0
     assert main(["view", "out", "output=page.html"]) == 0
     assert main(["rollout", *CHEAP, "body=out/rollout.h5", "output=again", "num_frames=2"]) == 2
-    assert "a rollout of store=cloth, whose body is no mesh here; make it with store=full" in capsys.readouterr().err
+    assert "a rollout of formats=[cloth], whose body is no mesh here; make it without" in capsys.readouterr().err
     assert json.loads(Path("out/summary.json").read_text())["num_frames"] == 12

@@ -130,7 +130,7 @@ def test_a_pickled_data_set_has_no_open_files(folder: Path) -> None:
 
 def test_the_parameters_of_a_body_give_its_vertices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    main(["rollout", *CHEAP, "num_frames=12", "store=cloth", "output=out"])
+    main(["rollout", *CHEAP, "num_frames=12", "formats=[cloth]", "output=out"])
     given = RolloutDataset(["out"], window=3, body="parameters", dtype=torch.float64)[7]
     shown = RolloutDataset(["out/rollout.h5"], window=3, body="pos", dtype=torch.float64)[7]
     sequence = hood.PoseSequence.from_arrays(given["body_poses"].numpy(), given["body_transl"].numpy(), 30.0)
