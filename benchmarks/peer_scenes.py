@@ -28,7 +28,7 @@ from hood.rollouts.equilibrium import find_equilibrium
 from hood.rollouts.loop import rest_state
 from hood.rollouts.verdict.surface import SurfaceMeter
 from hood.scene.body_motion.mesh_motion import NoBody
-from hood.scene.scene import Scene, build_scene, dress, local_origin
+from hood.scene.scene import Scene, build_scene, dressed_scene, local_origin
 from hood.solver.step_figures import strain_metrics
 from hood.steppers.newton import NewtonStepper
 from hood.testing import grid
@@ -182,7 +182,7 @@ def _scene_of(name: str, num_frames: int, fabric: Material, dtype: torch.dtype, 
     fps = FPS * substeps
     if name in SHEETS:
         width = CURTAIN if name.startswith("curtain") else WIDTH
-        return dress(sheet(SHEETS[name], width), NoBody((num_frames - 1) * substeps + 1, fps, dtype), fabric)
+        return dressed_scene(sheet(SHEETS[name], width), NoBody((num_frames - 1) * substeps + 1, fps, dtype), fabric)
     if name != "body":
         raise ValueError(f"scene {name!r}: choose of {', '.join(SCENES)}")
     return build_scene(load_garment(GARMENT), load_body("default"), load_sequence(MOTION, fps), fabric, dtype=dtype)

@@ -20,6 +20,7 @@ _HOMES = {
     "simulate": "hood.api",
     "Simulation": "hood.api",
     "rollout": "hood.api",
+    "dress": "hood.api",
     "export": "hood.api",
     "train": "hood.api",
     "load_model": "hood.api",

@@ -277,6 +277,36 @@ def export(rollout: str | Path, *, tell: Callable[[str], None] | None = None, **
     return target
 
 
+def dress(*, tell: Callable[[str], None] | None = None, **keys: Any) -> dict[str, dict[str, Any]]:
+    """Run ``hood dress`` with its keys: a data set of many rollouts in ``output``. Nothing is printed.
+
+    Args:
+        tell: is called with every line that the command prints: ``tell=print``.
+        keys: those of ``hood dress --help`` and ``hood rollout --help``, such as ``garments=["dress"], motions=["plie"]``.
+
+    Returns:
+        The lines of ``manifest.jsonl`` by the names of their rows; ``verdict`` is ``failed`` where there is no rollout. A
+        :class:`hood.RolloutDataset` of ``output`` reads the frames.
+
+    Raises:
+        ValueError, OSError: keys, files or a folder that cannot be used. A row that fails raises nothing.
+        KeyboardInterrupt: it was interrupted; the same call goes on.
+
+    Examples:
+        >>> import hood
+        >>> lines = hood.dress(garments=["tank"], motions=["plie"], num_frames=2, stepper="newton", output="outputs/few")
+        >>> lines["tank/default/default/plie"]["verdict"]
+        'sound'
+    """
+    from hood.app.batch.dress import dress_rows
+
+    with collected(tell):
+        done = dress_rows(overrides(keys))
+    if done.interrupted:
+        raise KeyboardInterrupt
+    return dict(done.lines)
+
+
 def train(*, tell: Callable[[str], None] | None = None, **keys: Any) -> Path:
     """Run ``hood train`` with its keys. Nothing is printed.
 

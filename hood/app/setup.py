@@ -36,7 +36,7 @@ from hood.rollouts.loop import own_start
 from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
 from hood.scene.fitting import doubts, misplacement
 from hood.scene.held_layers import with_held_layers_apart
-from hood.scene.scene import Scene, dress
+from hood.scene.scene import Scene, dressed_scene
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 from hood.steppers.static_shapes.cuda_graph import has_graphs
@@ -160,7 +160,7 @@ def make_scene(config: RolloutSettings, own: Own = NAMED) -> Scene:
     order = None if isinstance(given, Garment) else layer_order(config.layers, _names_in(garment, names))
     garment = cut_to_size(config, garment, motion)
     fabric = fabric_of(config, garment, motion) if own.material is None else own.material
-    scene = with_events(replace(dress(garment, motion, fabric, checked_sizes(config)), layers=order), config)
+    scene = with_events(replace(dressed_scene(garment, motion, fabric, checked_sizes(config)), layers=order), config)
     scene = with_body_friction(scene, config)
     found = misplacement(scene)
     if found is not None and found.grave:

@@ -108,11 +108,15 @@ def rim_length(pos: np.ndarray, rim: np.ndarray) -> float:
 
 def num_through(rim: np.ndarray, body_pos: np.ndarray, body_edges: np.ndarray) -> int:
     """How many edges of the body go through the fan of triangles between an opening (N, 3) [m] and its middle."""
-    start, end = body_pos[body_edges[:, 0]], body_pos[body_edges[:, 1]]
-    near = (np.minimum(start, end) <= rim.max(axis=0)).all(axis=1) & (np.maximum(start, end) >= rim.min(axis=0)).all(axis=1)
-    start, way = start[near], (end - start)[near]
-    if not len(start):
+    low, high = rim.min(axis=0), rim.max(axis=0)
+    near = body_edges
+    for axis in np.argsort(high - low):  # the shortest side of the rim's box leaves the fewest edges
+        first, second = body_pos[near[:, 0], axis], body_pos[near[:, 1], axis]
+        near = near[(np.minimum(first, second) <= high[axis]) & (np.maximum(first, second) >= low[axis])]
+    if not len(near):
         return 0
+    start = body_pos[near[:, 0]]
+    way = body_pos[near[:, 1]] - start
     middle = rim.mean(axis=0)
     first, second = rim - middle, np.roll(rim, -1, axis=0) - middle  # sides of the triangles, (N, 3)
     normal = np.cross(first, second)

@@ -259,10 +259,10 @@ def build_scene(
     if material is not None and not isinstance(material, Material):
         raise ValueError(f"build_scene takes a hood.Material, or None for the default fabric, not {type(material).__name__}")
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
-    return dress(garment, body_motion(body, sequence, betas, dtype, device), material, size)
+    return dressed_scene(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 
 
-def dress(garment: Garment, motion: Motion, material: Material | None = None, size: GarmentSize | Sizes = 1.0) -> Scene:
+def dressed_scene(garment: Garment, motion: Motion, material: Material | None = None, size: GarmentSize | Sizes = 1.0) -> Scene:
     """Garment on whatever moves, in the motion's precision and on its device; ``size`` scales the rest shape, which is that of
     the body's shape if it is made to measure.
 

@@ -22,7 +22,7 @@ from hood.assets.motion.sequence import PoseSequence, turn_world
 from hood.cloth.cloth import Cloth
 from hood.scene.body_motion.motion import BodyMotion, body_motion
 from hood.scene.holding import fastening_of
-from hood.scene.scene import Scene, dress
+from hood.scene.scene import Scene, dressed_scene
 from hood.tensors.batch import to_device
 
 #: Draws before a set of motions that cannot be read is given up.
@@ -139,7 +139,7 @@ class SceneSampler:
         material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction, uniform=self.uniform)
         mirrored = self.mirror and rng.random() < 0.5
         body, worn = self._assets(index, mirrored)
-        scene = dress(worn, body_motion(body, window, betas), material, size)
+        scene = dressed_scene(worn, body_motion(body, window, betas), material, size)
         still = self.still_fraction > 0 and rng.random() < self.still_fraction
         return Window(scene, min(start, 1), index, mirrored, still)
 

@@ -27,7 +27,7 @@ from hood.rollouts.equilibrium import Rest, find_equilibrium, without_hold
 from hood.rollouts.frame import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_names
 from hood.rollouts.loop import own_start, simulate
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
-from hood.scene.scene import Scene, build_scene, dress
+from hood.scene.scene import Scene, build_scene, dressed_scene
 from hood.solver import retry
 from hood.steppers.network import build_simulator
 from hood.steppers.newton import NewtonStepper, Stepper
@@ -128,7 +128,7 @@ def sheet(held: bool, height: float = 1.5) -> Garment:
 
 
 def test_without_a_body_a_sheet_hangs_from_its_pins() -> None:
-    scene = dress(sheet(held=True), NoBody(3, 30.0))
+    scene = dressed_scene(sheet(held=True), NoBody(3, 30.0))
     rest = settled(scene)
     height = (rest.pos + scene.start(0).origin.to(rest.pos))[:, 1]
     assert rest.reached
@@ -140,7 +140,7 @@ def test_what_nothing_holds_is_left_as_it_is() -> None:
     """A part without pins, where there is no body, falls from its start."""
     tube = cylinder(8, 3, 0.1, 0.1)
     loose = join_garments([sheet(held=True), Garment("tube", *tube, np.zeros(len(tube[0]), dtype=bool))])
-    scene = dress(loose, NoBody(3, 30.0))
+    scene = dressed_scene(loose, NoBody(3, 30.0))
     assert without_hold(scene) is not None
     with pytest.warns(UserWarning, match="is not settled, it falls from its start: "):
         frame = first_frame(NewtonStepper(POTENTIAL), scene)
@@ -150,7 +150,7 @@ def test_what_nothing_holds_is_left_as_it_is() -> None:
 @pytest.mark.parametrize("held", [True, False])
 def test_a_sheet_starts_as_it_is_given(held: bool, body: Body, walk: PoseSequence) -> None:
     """It is to fall, or to swing down from its pins."""
-    scene = dress(sheet(held=True), NoBody(3, 30.0)) if held else sheet_above(body, walk)
+    scene = dressed_scene(sheet(held=True), NoBody(3, 30.0)) if held else sheet_above(body, walk)
     assert own_start(NewtonStepper(POTENTIAL), scene) == "a sheet starts as it is given"
     assert_as_in_the_paper(first_frame(NewtonStepper(POTENTIAL), scene), scene)
 
@@ -165,7 +165,7 @@ def sheet_above(body: Body, walk: PoseSequence) -> Scene:
     """A level sheet ten centimetres above a body that is a mesh: it is to fall on it."""
     surface = body.surface(walk.window(0, 1), np.zeros(10), torch.float64).numpy()
     sequence = MeshSequence("doll", surface, body.faces, 30.0)
-    return dress(sheet(held=False, height=float(surface[0, :, 1].max()) + 0.1), mesh_motion(sequence, 3))
+    return dressed_scene(sheet(held=False, height=float(surface[0, :, 1].max()) + 0.1), mesh_motion(sequence, 3))
 
 
 def test_a_garment_that_slides_off_starts_as_it_is_put_on(body: Body, walk: PoseSequence) -> None:
@@ -238,7 +238,7 @@ def test_what_lies_still_does_not_hide_what_moves() -> None:
     """The speed is that of the fastest garment of an outfit; pinned vertices do not count."""
     tube = cylinder(8, 3, 0.1, 0.1)
     outfit = join_garments([sheet(held=True), Garment("tube", *tube, np.zeros(len(tube[0]), dtype=bool))])
-    parts = equilibrium._Parts(dress(outfit, NoBody(3, 30.0)).cloth)
+    parts = equilibrium._Parts(dressed_scene(outfit, NoBody(3, 30.0)).cloth)
     moved = torch.cat([torch.full((36,), 1e-3), torch.full((24,), 5e-3)])
     moved[torch.as_tensor(outfit.pinned)] = 1.0
     assert sorted(parts.means(moved).tolist()) == pytest.approx([1e-3, 5e-3])

@@ -18,7 +18,7 @@ from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.energies.problem import StepProblem
 from hood.scene.body_motion.motion import BodyMotion, body_motion
-from hood.scene.scene import dress
+from hood.scene.scene import dressed_scene
 from hood.steppers.published import detect_layout, import_reference_weights, network_sources
 from hood.training.scenes import SceneSampler, Window
 from hood.training.trainer import Trainer
@@ -35,7 +35,7 @@ class Doubled(SceneSampler):
         motion = window.scene.motion
         assert isinstance(motion, BodyMotion)
         precise = body_motion(self.body, motion.sequence, motion.betas, torch.float64)
-        return Window(dress(self.garments[0], precise, self.material), window.start_frame, still=window.still)
+        return Window(dressed_scene(self.garments[0], precise, self.material), window.start_frame, still=window.still)
 
 
 class Transcription:

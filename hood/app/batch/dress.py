@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
+import random
 import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from hood.app.batch.manifest import (
     require_same_rows,
 )
 from hood.app.batch.rows import AXES, DataRow, rows_of
-from hood.app.batch.work import Call, cause_of, clear, silently
+from hood.app.batch.work import Call, cause_of, clear, settings_of, silently
 from hood.app.common import output_folder, prepare_folder
 from hood.app.output.export import check_outputs
 from hood.app.output.verdict import FAIL_ON_DOUBTS, FAIL_ON_NOTHING
@@ -46,6 +46,7 @@ from hood.assets.files.atomic import occupy
 from hood.assets.files.library import unknown
 from hood.assets.files.said import say, unheard
 from hood.assets.motion.motion_files import frames_by_header
+from hood.rollouts.file.reader import read_rollout
 
 #: What rows have unless the command says otherwise: pictures of thousands are of use to nobody.
 _USUAL = ("video=none", "sheet=false")
@@ -57,6 +58,8 @@ _FREE = (*_OF_ROWS, "output", "resume", "fail_on")
 _RETRY = ("none", "failed", "unsound")
 #: Rows that a dry run looks at, frames of each, a few and more, and motions that it reads where headers tell no length.
 _PROBES, _PROBE_FRAMES, _READ = 6, (4, 30), 20
+#: The sheet of rows: its file, the size of a picture and how many are in a row, and letters of a name.
+_THUMBNAILS, _WIDTH, _HEIGHT, _COLUMNS, _LETTERS = "thumbnails.png", 240, 336, 6, 36
 #: Lines of a list at the end.
 _SHOWN = 10
 
@@ -129,6 +132,8 @@ def _work(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow], fol
     if not tells_user():
         return Dressed(lines, len(rows), interrupted, 130 if interrupted else 0)
     clear(folder)
+    if int(config.thumbnails) and not interrupted and (left or not (folder / _THUMBNAILS).exists()):
+        _draw_rows(config, lines, folder)
     code = 130 if interrupted else _conclude(config, lines, len(rows), folder, fail_on)
     return Dressed(lines, len(rows), interrupted, code)
 
@@ -156,7 +161,7 @@ def _check(config: DictConfig) -> None:
     require_choice(config, "retry", _RETRY)
     if not 0.0 <= float(config.fail_fraction) <= 1.0:
         raise ConfigError(f"fail_fraction={shown(config.fail_fraction)}: give a share of the rows, 0 to 1")
-    for key, least in (("attempts", 1), ("seed", 0)):
+    for key, least in (("attempts", 1), ("seed", 0), ("thumbnails", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     output_folder(config)
@@ -269,6 +274,41 @@ def _without_numbers(line: Line) -> str:
     return cause_of(reasons[0])
 
 
+def _draw_rows(config: DictConfig, lines: Mapping[str, Line], folder: Path) -> None:
+    """``thumbnails.png``: rows that are drawn by chance, then the worst ones, each in its worst frame."""
+    try:
+        from hood.media.film import Film
+        from hood.media.renderer.render import contact_sheet
+        from hood.media.video import save_png
+    except ImportError as error:
+        say(f"no {_THUMBNAILS}: {error}", error=True)
+        return
+    made = sorted(name for name, line in lines.items() if line["frames"] and line["verdict"] != FAILED)
+    most = min(int(config.thumbnails), len(made))
+    worst = sorted(made, key=lambda name: _badness(lines[name]), reverse=True)[:most]
+    chance = sorted(random.Random(int(config.seed)).sample(made, most)) if len(made) > most else []
+    pictures, labels = [], []
+    for what, name in (*(("by chance", name) for name in chance), *(("worst", name) for name in worst)):
+        line = lines[name]
+        try:
+            data = read_rollout(folder / name / "rollout.h5")
+            frame = min(line.get("worst", {}).get("frame", 0), len(data.cloth_pos) - 1)
+            pictures.append(Film(data, _WIDTH, _HEIGHT).picture(frame))
+        except (OSError, ValueError, ImportError) as error:
+            say(f"no picture of {name}: {error}", error=True)
+            continue
+        short = name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}"
+        labels.append(f"{short}\n{what}, {line['verdict']}, frame {frame}")
+    if pictures:
+        save_png(folder / _THUMBNAILS, contact_sheet(pictures, min(_COLUMNS, len(pictures)), labels))
+        say(f"{len(chance)} rows by chance and the {len(worst)} worst: {folder / _THUMBNAILS}")
+
+
+def _badness(line: Line) -> tuple[int, float]:
+    """Orders rows: unsound ones are worse than doubtful ones, then more strain is worse."""
+    return (line["verdict"] == DOUBTFUL) + 2 * (line["verdict"] == UNSOUND), float(line.get("worst", {}).get("value") or 0.0)
+
+
 # ---- dry run ---------------------------------------------------------------------------------------------------------
 
 
@@ -338,7 +378,7 @@ def _probe(words: Sequence[str], row: DataRow, folder: Path) -> _Cost:
     """Simulate a few frames of a row, and more; what these took longer is the frames'."""
     spent, sizes, counts = [], [], []
     for most in _PROBE_FRAMES:
-        config = RolloutSettings.from_words([*words, *row.words])
+        config = settings_of(words, row)
         config = config.with_values(num_frames=min(int(config.num_frames), most), output=str(folder))
         check_config(config)
         began, here = time.process_time(), folder / str(most)
@@ -363,7 +403,7 @@ def _frames_of(words: Sequence[str], rows: Sequence[DataRow]) -> list[float]:
     missing = [row for row, count in zip(rows, counted, strict=True) if count is None]
     read = []
     for row in missing[:: max(1, len(missing) // _READ)][:_READ]:
-        config = RolloutSettings.from_words([*words, *row.words])
+        config = settings_of(words, row)
         try:
             with unheard():
                 read.append(min(int(config.num_frames), make_scene(config).num_frames))
@@ -375,19 +415,13 @@ def _frames_of(words: Sequence[str], rows: Sequence[DataRow]) -> list[float]:
 
 def _count(words: Sequence[str], row: DataRow) -> float | None:
     """Frames of a row by the header of its motion; None where it does not tell."""
-    own = tuple(word for word in row.words if word.partition("=")[0] not in ("seed", "sequence"))
-    config = _loaded(tuple(words), own)
+    config = settings_of(words, row)
     known = [config.start, config.stop, config.blend_in]
     if any(value is not None and not isinstance(value, (int, float)) for value in known):
         return None
-    length = frames_by_header(row.keys.get("sequence", str(config.sequence)).strip("'\""), config.fps, config.file_fps)
+    length = frames_by_header(str(config.sequence), config.fps, config.file_fps)
     if length is None:
         return None
     last = length - 1 if config.stop is None else min(length - 1, float(config.stop) * config.fps)
     played = max(last - float(config.start or 0.0) * config.fps, 0.0) + 1
     return min(float(config.num_frames), played * int(config.loop) + float(config.blend_in) * config.fps)
-
-
-@lru_cache(maxsize=64)
-def _loaded(words: tuple[str, ...], own: tuple[str, ...]) -> RolloutSettings:
-    return RolloutSettings.from_words([*words, *own])

@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from omegaconf import DictConfig
@@ -165,12 +167,14 @@ class Pool:
     def _start(self, first: int) -> tuple[SpawnProcess, Connection]:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe(duplex=False)
-        before = os.environ.get("OMP_NUM_THREADS")
+        before, caller = os.environ.get("OMP_NUM_THREADS"), sys.modules["__main__"]
         os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is loaded
+        sys.modules["__main__"] = ModuleType("__main__")  # the process does not run a caller's script again
         try:
             process = context.Process(target=_worker, args=(self.call, self.rows, first, there), daemon=True)
             process.start()
         finally:
+            sys.modules["__main__"] = caller
             os.environ.pop("OMP_NUM_THREADS")
             if before is not None:
                 os.environ["OMP_NUM_THREADS"] = before

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from hood.app.batch.rows import DataRow
 from hood.app.notices import Item
 from hood.app.rollout import roll_out_into
 from hood.app.settings.compose import plain
+from hood.app.settings.overrides import parse
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import check_config, make_stepper
 
@@ -40,6 +42,8 @@ _HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _SILENCE, _SIGN = 600.0, 60.0
 #: Seconds that a file of a claim may be empty, between its making and its writing.
 _WRITING = 10.0
+#: Keys of a rollout that every row has of its own.
+_OWN = ("seed", "sequence")
 #: Keys of a rollout that change nothing in it.
 _FREE = ("output", "root", "resume", "fail_on")
 
@@ -120,7 +124,7 @@ def _made(call: Call, row: DataRow, attempt: int) -> Line:
     line = _line(row, inputs_of(row)) | {"attempts": attempt}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        config = RolloutSettings.from_words([*call.words, *row.words]).with_values(output=str(place))
+        config = settings_of(call.words, row).with_values(output=str(place))
         check_config(config)
         stepper, weights = make_stepper(config)
         summary = roll_out_into(config, stepper, weights, silently, temporary)
@@ -140,6 +144,22 @@ def _made(call: Call, row: DataRow, attempt: int) -> Line:
         sentence = text if known else f"{type(error).__name__}: {text}"
         return line | _failure(sentence) | _times(began, spent)
     return line
+
+
+def settings_of(words: Sequence[str], row: DataRow) -> RolloutSettings:
+    """The settings of a row, with the ``words`` that all have; those of its garment, body and fabric are read once.
+
+    Raises:
+        ConfigError: a word that cannot be used.
+    """
+    own = {key: parse(word).value() for word in row.words if (key := word.partition("=")[0]) in _OWN}
+    alike = (word for word in row.words if word.partition("=")[0] not in _OWN)
+    return _settings((*words, *alike)).with_values(**own)
+
+
+@lru_cache(maxsize=64)
+def _settings(words: tuple[str, ...]) -> RolloutSettings:
+    return RolloutSettings.from_words(words)
 
 
 def _refusal(error: BaseException | None) -> int | None:
@@ -181,12 +201,14 @@ def cause_of(sentence: str) -> str:
 
 def _result(config: RolloutSettings, summary: Mapping[str, Any], weights: str) -> Line:
     settings = {key: value for key, value in plain(config).items() if key not in _FREE}
+    worst = next((dict(reason) for reason in summary["reasons"]), None) or summary["worst_frames"].get("strain_p99", {})
     return {
         "verdict": verdict_of(summary),
         "doubts": [{"kind": doubt["kind"], "sentence": doubt["sentence"]} for doubt in summary["doubts"]],
         "reasons": list(summary["unsound_reasons"]),
         "settings_sha256": hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest(),
         "weights_sha256": weights,
+        "worst": {"value": worst.get("value"), "frame": int(worst.get("frame") or 0)},
         "frames": int(summary["num_frames"]),
         "vertices": int(summary["num_vertices"]),
     }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,12 @@ def load_body(name: str | Path = "default", gender: str | None = None) -> Body:
     path = locate("body", name, folders=True)
     if path.is_dir():
         path = choose_model(path, gender)
+    return _read_body(path, path.stat().st_mtime_ns, path.stat().st_size)
+
+
+@lru_cache(maxsize=1)
+def _read_body(path: Path, changed: int, size: int) -> Body:
+    """The body of a file; many rollouts of one process ask for the same, as it was ``changed`` last [ns]."""
     arrays = read_model(path)
     if "posedirs" in arrays and np.any(arrays["posedirs"]):
         return smpl_family_body(path, arrays)

@@ -36,7 +36,7 @@ from hood.cli.inspect.findings import Finding
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.mesh_motion import MeshMotion
 from hood.scene.fitting import fit_figures, misplacement
-from hood.scene.scene import LEAD_IN, NotWornError, Scene, dress
+from hood.scene.scene import LEAD_IN, NotWornError, Scene, dressed_scene
 
 #: A root that moves faster [m/s] than this in one of a hundred frames is no person's.
 _FASTEST = 20.0
@@ -242,7 +242,7 @@ def _fit(found: list[Finding], body: str, config: DictConfig) -> dict[str, Any] 
     try:
         with heard(aloud=False):  # what single files are warned about stands with them
             performed = load_motion(body, motion, _options(config))
-            scene = dress(read_outfit(garments, performed, triangulate=True, wanted=wanted_of(config)), performed)
+            scene = dressed_scene(read_outfit(garments, performed, triangulate=True, wanted=wanted_of(config)), performed)
         misplaced = misplacement(scene, on_meshes=True)
         skinned, start = fit_figures(scene, settled=False), fit_figures(scene)
     except (ValueError, OSError) as error:

@@ -38,7 +38,7 @@ from hood.mesh.editing.quality import check_triangles
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.mesh_motion import MeshMotion
 from hood.scene.fitting import FitFigures, fit_figures
-from hood.scene.scene import dress
+from hood.scene.scene import dressed_scene
 
 
 def fasten_as_asked(fitting: Fitting, config: DictConfig) -> np.ndarray:
@@ -94,7 +94,7 @@ def prepare_for_mesh(config: DictConfig, names: list[str], target: Path, read: C
     assert isinstance(motion, MeshMotion)
     fittings = [_fit(read(name), name, config, motion) for name in names]
     outfit = _pin(join_garments([fitting.garment for fitting in fittings]), fittings, config)
-    scene = dress(outfit, motion)
+    scene = dressed_scene(outfit, motion)
     scene.start(0, thorough=True)  # refuses what a limb passes through
     figures = fit_figures(scene)
     prepare_folder(target.parent)

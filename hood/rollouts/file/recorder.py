@@ -227,7 +227,8 @@ class RolloutWriter:
         # HDF5 lays contiguous data out at the first write; one row is enough to allocate and fill everything.
         tables = (*_field_paths(self._file), *_metric_paths(self._file), *_alarm_paths(self._file), *step_paths(self._file))
         for name in ("cloth/pos", "body/pos", *tables):
-            self._file[name][-1] = self._file[name].fillvalue
+            table = self._file[name]
+            table[-1] = np.full(table.shape[1:], table.fillvalue)  # of a single value h5py makes a write a vertex
 
     def __enter__(self) -> RolloutWriter:
         return self

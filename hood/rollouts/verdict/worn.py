@@ -80,7 +80,7 @@ class _Group:
 
     def away(self, pos: np.ndarray, body: np.ndarray) -> float:
         """How much farther from their regions than in frame 0 its vertices are [m], at their ``share``."""
-        dist_sq = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).min(axis=1)
+        dist_sq = _squares(pos[self.vertices], body, self.region).min(axis=1)
         return float(np.quantile(np.sqrt(dist_sq) - self.start, self.share))
 
 
@@ -94,7 +94,7 @@ class _Followed:
 
     def ways(self, pos: np.ndarray, body: np.ndarray) -> np.ndarray:
         """(N, 3) m: how they have moved along the body, as on the body of frame 0."""
-        near = ((pos[self.vertices][:, None] - body[self.region]) ** 2).sum(axis=2).argmin(axis=1)
+        near = _squares(pos[self.vertices], body, self.region).argmin(axis=1)
         now = self.places[self.region[np.arange(len(near)), near]]
         return np.asarray(now - self.places[self.region[:, 0]])
 
@@ -219,6 +219,17 @@ def measure_wear(
     rows = [meter(pos[frame].astype(np.float64), body_pos[frame].astype(np.float64)) for frame in frames]
     away, slipped, sunk, shifted = np.array(rows).swapaxes(0, 1)
     return Wear(np.asarray(frames), away, slipped, sunk, shifted, meter.num_vertices, meter.first_vertex, meter.gap)
+
+
+def _squares(pos: np.ndarray, body: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """(N, K) m²: from points (N, 3) to those of the body (B, 3) in the ``region`` (N, K) of each, an axis after the other."""
+    found, apart = np.zeros(region.shape), np.empty(region.shape)
+    for axis in range(3):
+        np.take(body[:, axis], region, out=apart, mode="clip")  # which writes there without a check of its own
+        apart -= pos[:, axis, None]
+        apart *= apart
+        found += apart
+    return found
 
 
 def _to_follow(

@@ -16,7 +16,7 @@ from hood.energies.damping import BendDamping, StretchDamping
 from hood.energies.wind import Wind
 from hood.rollouts.frame import Ease
 from hood.scene.body_motion.motion import BodyMotion
-from hood.scene.scene import dress
+from hood.scene.scene import dressed_scene
 from hood.scene.sizing import Sizes
 
 
@@ -67,7 +67,7 @@ def test_factors_of_parts_cut_the_garment(garments: dict[str, Garment]) -> None:
 def test_a_pattern_made_to_measure_grows_with_the_body_and_another_does_not(garments: dict[str, Garment]) -> None:
     motion = make_motion(RolloutSettings.from_words(["betas=[2]"]), torch.float64)
     tank = garments["tank"]
-    own, plain = (dress(tank, motion, size=Sizes(to_measure=measured)).cloth for measured in (True, False))
+    own, plain = (dressed_scene(tank, motion, size=Sizes(to_measure=measured)).cloth for measured in (True, False))
     assert torch.equal(plain.rest_pos, torch.as_tensor(tank.rest_pos))
     assert torch.equal(own.rest_pos, torch.as_tensor(motion.rest_pos(motion.dressed(tank))))
     assert float(own.rest_area.sum()) > 1.02 * float(plain.rest_area.sum())

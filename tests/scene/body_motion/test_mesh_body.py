@@ -17,7 +17,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.energies.potential import default_potential
 from hood.rollouts.loop import simulate
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
-from hood.scene.scene import build_scene, dress
+from hood.scene.scene import build_scene, dressed_scene
 from hood.solver.newton import NewtonSettings
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.newton import NewtonStepper, Stepper
@@ -38,7 +38,7 @@ def largest_gap(kind: str, count: int, garment: Garment, body: Body, walk: PoseS
     start = parametric.start(0)
     pos, vel = start.pos.double().numpy() + start.origin.numpy(), start.vel.double().numpy()
     worn = replace(parametric.garment, lbs_weights=None, skin_pos=pos)
-    on_mesh = dress(worn, mesh_motion(load_mesh_sequence(folder / "walk.npz")))
+    on_mesh = dressed_scene(worn, mesh_motion(load_mesh_sequence(folder / "walk.npz")))
     rollouts = []
     for scene in (parametric, on_mesh):
         given = replace(scene, start_pos=pos, start_vel=vel)
@@ -67,7 +67,7 @@ def test_fifty_frames_on_vertices_from_a_file(
 def test_without_a_body_pins_hold_and_the_rest_falls(kind: str, garments: dict[str, Garment]) -> None:
     skirt = garments["skirt"]
     for pinned in (skirt.pinned, np.zeros_like(skirt.pinned)):
-        scene = dress(replace(skirt, pinned=pinned), NoBody(4, 30.0))
+        scene = dressed_scene(replace(skirt, pinned=pinned), NoBody(4, 30.0))
         frames = list(simulate(make_stepper(kind), scene, default_potential(), 4, 0))
         assert len(frames) == 4
         assert frames[0].body_pos.shape == (0, 3)

@@ -16,7 +16,7 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import arms_down
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
 from hood.scene.body_motion.motion import body_motion
-from hood.scene.scene import Scene, dress
+from hood.scene.scene import Scene, dressed_scene
 from hood.scene.start import free_stretch
 from hood.testing import cylinder, grid, sphere
 
@@ -66,7 +66,7 @@ def test_garments_turn_with_what_is_next_to_them() -> None:
     for frame in range(6):
         expected = turns[frame].apply(TUBE.rest_pos) + path[frame]
         np.testing.assert_allclose(motion.skinned(TUBE, frame, np.zeros(3)), expected, rtol=0, atol=1e-9)
-    scene = dress(TUBE, motion)
+    scene = dressed_scene(TUBE, motion)
     velocity = (turns[1].apply(TUBE.rest_pos) + path[1] - TUBE.rest_pos) * 30
     np.testing.assert_allclose(scene.start_velocity(0), velocity, atol=1e-7)
     # Pins reach where the body carries them.
@@ -78,11 +78,11 @@ def test_garments_turn_with_what_is_next_to_them() -> None:
 def test_the_garment_starts_where_it_was_given() -> None:
     """A garment that fits starts as it is; ``skin_pos`` says where where the rest shape does not."""
     motion = mesh_motion(turning()[0])
-    state = dress(TUBE, motion).start(0)
+    state = dressed_scene(TUBE, motion).start(0)
     np.testing.assert_allclose(state.pos.double().numpy() + state.origin.numpy(), TUBE.rest_pos, atol=1e-6)
     elsewhere = replace(TUBE, rest_pos=TUBE.rest_pos @ Rotation.from_euler("x", 1).as_matrix() + 3, skin_pos=TUBE.rest_pos)
     np.testing.assert_array_equal(elsewhere.worn_pos, TUBE.rest_pos)
-    scene = dress(elsewhere, motion)
+    scene = dressed_scene(elsewhere, motion)
     np.testing.assert_allclose(scene.cloth.rest_pos, elsewhere.rest_pos, atol=1e-6)
     pos = scene.start(0).pos.double().numpy() + scene.start(0).origin.numpy()
     np.testing.assert_allclose(pos, TUBE.rest_pos, atol=1e-6)
@@ -91,7 +91,7 @@ def test_the_garment_starts_where_it_was_given() -> None:
 def test_vertices_inside_the_body_start_outside() -> None:
     motion = mesh_motion(turning()[0])
     tight = replace(TUBE, rest_pos=TUBE.rest_pos * [0.935, 1, 0.935])  # 4 mm inside at the equator
-    scene = dress(tight, motion)
+    scene = dressed_scene(tight, motion)
     state = scene.start(0)
     world = state.pos.double().numpy() + state.origin.numpy()
     free = ~TUBE.pinned
@@ -102,16 +102,16 @@ def test_vertices_inside_the_body_start_outside() -> None:
 def test_garments_elsewhere_are_refused(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
     motion = mesh_motion(exported(body, walk.window(60, 63), np.zeros(10)))
     with pytest.raises(ValueError, match="'skirt': not worn by 'exported' in its first frame.*weights"):
-        dress(garments["skirt"], motion)
+        dressed_scene(garments["skirt"], motion)
     with pytest.raises(ValueError, match="'skirt': not worn by 'exported' in its first frame"):
-        dress(replace(garments["skirt"], lbs_weights=None, bound_to=None), motion)
+        dressed_scene(replace(garments["skirt"], lbs_weights=None, bound_to=None), motion)
     # A sheet may well fall on the body from afar.
     sheet, faces = grid(5, 5, 0.4)
     with pytest.warns(UserWarning, match="'sheet': half of it is over"):
-        dress(Garment("sheet", sheet + [0.0, 3.0, 0.0], faces, np.zeros(25, dtype=bool)), motion)
+        dressed_scene(Garment("sheet", sheet + [0.0, 3.0, 0.0], faces, np.zeros(25, dtype=bool)), motion)
     inside = replace(TUBE, rest_pos=TUBE.rest_pos * 0.8)
     with pytest.raises(ValueError, match=r"'tube': not worn by 'ball'.*% of the vertices are deeper than 2 cm"):
-        dress(inside, mesh_motion(turning()[0]))
+        dressed_scene(inside, mesh_motion(turning()[0]))
 
 
 def in_t_pose(garment: Garment) -> Garment:
@@ -124,7 +124,7 @@ def test_a_garment_that_a_limb_passes_through_is_refused(garments: dict[str, Gar
     """A shirt as it is worn in the T-pose, near the skin of a body in A-pose but for the sleeves."""
     shirt = in_t_pose(garments["tshirt"])
     verts = [body.surface(arms_down(angle), np.zeros(10), torch.float64).numpy() for angle in (0.0, 45.0)]
-    right, wrong = (dress(shirt, mesh_motion(MeshSequence("still", v, body.faces, 30.0))) for v in verts)
+    right, wrong = (dressed_scene(shirt, mesh_motion(MeshSequence("still", v, body.faces, 30.0))) for v in verts)
     assert float(free_stretch(right.cloth, right.start(0, thorough=True).pos).max()) < 0.01
     with pytest.raises(ValueError, match="'tshirt': passes through 'still' in frame 0 .*hood prepare"):
         wrong.start(0, thorough=True)
@@ -140,12 +140,12 @@ def test_weights_for_the_meshs_joints(garments: dict[str, Garment], body: Body, 
     for frame in (0, 3):
         first, second = (m.skinned(skirt, frame, np.zeros(3)) for m in (mesh, motion))
         np.testing.assert_allclose(first, second, rtol=0, atol=1e-9)
-    assert dress(skirt, mesh).start(0).pos.isfinite().all()
+    assert dressed_scene(skirt, mesh).start(0).pos.isfinite().all()
     with pytest.raises(ValueError, match="weights for 20 joints, 'exported' has 24"):
-        dress(replace(skirt, lbs_weights=skirt.lbs_weights[:, :20]), mesh)
+        dressed_scene(replace(skirt, lbs_weights=skirt.lbs_weights[:, :20]), mesh)
     # Weights that belong to another body do not count.
     with pytest.raises(ValueError, match="not worn"):
-        dress(replace(skirt, bound_to="default"), mesh)
+        dressed_scene(replace(skirt, bound_to="default"), mesh)
 
 
 def test_garments_around_the_rest_pose_of_a_skinned_mesh(garments: dict[str, Garment], body: Body, walk: PoseSequence) -> None:
@@ -184,7 +184,7 @@ def test_a_still_mesh_is_held() -> None:
     obstacle = motion.obstacle(38, np.zeros(3))
     assert torch.equal(obstacle.pos, obstacle.next_pos)
     assert torch.equal(obstacle.pos, obstacle.prev_pos)
-    scene = dress(TUBE, motion)
+    scene = dressed_scene(TUBE, motion)
     assert scene.dt == pytest.approx(1 / 60)
     assert not bool(scene.start_velocity(0).abs().max() > 1e-9)
 
@@ -208,7 +208,7 @@ def test_no_body() -> None:
     assert motion.surface(2, np.zeros(3)).shape == (0, 3)
     assert motion.faces.shape == (0, 3)
     far = replace(TUBE, rest_pos=TUBE.rest_pos + [100.0, 0, 0])
-    scene = dress(far, motion)
+    scene = dressed_scene(far, motion)
     state = scene.start(0)
     np.testing.assert_allclose(state.pos.double().numpy() + state.origin.numpy(), far.rest_pos, atol=1e-5)
     step = scene.step_input(0, state)
