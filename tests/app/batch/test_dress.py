@@ -22,12 +22,17 @@ from hood.app.batch import engines, work
 from hood.app.batch.dress import _frames_of
 from hood.app.batch.manifest import Manifest, own_line, read_manifest
 from hood.app.batch.rows import DataRow, row_seed, rows_of
-from hood.app.batch.work import Call, HopelessError, pull
+from hood.app.batch.work import Call, HopelessError, pull, settings_of
 from hood.app.settings.compose import ConfigError, load_config
+from hood.app.settings.python_words import overrides
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.cli.main import main
+from hood.media.film import Film
 
 #: What makes rows cheap.
 CHEAP = ["garments=[tank]", "num_frames=2", "metrics=none", "guard=off", "stepper=guess", "settle=0"]
+
+BLANK = np.zeros((8, 8, 3), dtype=np.uint8)
 
 
 @pytest.fixture
@@ -184,6 +189,48 @@ def test_a_set_with_a_broken_row_goes_on_and_is_not_made_twice(
     assert "3 rows were whole and had no line" in told.out
     assert "1 rows are made again: their files have other content now" in told.out
     assert len(read_manifest(Path("out"))) == 3
+
+
+def test_settings_of_a_row_are_those_of_its_words(tmp_path: Path) -> None:
+    words = ("stepper=guess", "num_frames=2")
+    for sequence in ("plie", str(tmp_path / "2024_01"), "007", "a b, c's [1].npz", 'ü"q\\.npz', "none"):
+        (row,) = rows_of_keys([{"sequence": sequence, "garment": "tank"}])
+        assert settings_of(words, row) == RolloutSettings.from_words([*words, *row.words])
+        assert settings_of(words, row).sequence == sequence
+
+
+def rows_of_keys(keys: list[dict[str, Any]]) -> list[DataRow]:
+    return [DataRow(f"r{number}", tuple(overrides({"seed": number, **one}))) for number, one in enumerate(keys)]
+
+
+def test_thumbnails_show_the_worst_row_in_its_worst_frame(
+    motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_this_process(monkeypatch)
+    drawn = list[tuple[str, int]]()
+    monkeypatch.setattr(Film, "picture", lambda film, frame: drawn.append((film.data.attributes["sequence"], frame)) or BLANK)
+    command = ["dress", *CHEAP, "motions=motions", "output=out", "fail_on=nothing"]
+    assert main([*command, "thumbnails=0"]) == 2
+    assert not Path("out/thumbnails.png").exists()
+    lines = [json.loads(text) for text in Path("out/manifest.jsonl").read_text().splitlines()]
+    for line in lines:
+        line |= {"verdict": "unsound", "worst": {"value": 0.1, "frame": 1}} if "s1/walk" in line["row"] else {}
+    Path("out/manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    main([*command, "thumbnails=1"])
+    assert "1 rows by chance and the 1 worst" in capsys.readouterr().out
+    assert drawn[1] == ("walk", 1)
+    assert Path("out/thumbnails.png").stat().st_size > 0
+    main([*command, "thumbnails=1"])  # nothing is made: it stays
+    assert len(drawn) == 2
+
+
+def test_a_script_makes_a_data_set_and_is_not_run_again(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    keys = "garments=['tank'], motions=['plie'], num_frames=2, metrics='none', guard='off', stepper='guess', settle=0"
+    script.write_text(f"print('begun')\nimport hood\nprint(hood.dress({keys}, output='out', workers=1).keys())\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.stdout == "begun\ndict_keys(['tank/default/default/plie'])\n", done.stderr
 
 
 @pytest.mark.parametrize(

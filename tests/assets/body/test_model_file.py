@@ -103,6 +103,15 @@ def test_official_pickles_without_chumpy(tmp_path: Path, protocol: int) -> None:
         np.testing.assert_allclose(getattr(second, name), getattr(first, name), rtol=0, atol=1e-15)
 
 
+def test_a_file_that_changes_is_read_again(tmp_path: Path) -> None:
+    arrays = model_arrays(24, 10)
+    np.savez(tmp_path / "a.npz", **arrays)
+    first = load_body(tmp_path / "a.npz")
+    assert load_body(tmp_path / "a.npz") is first
+    np.savez(tmp_path / "a.npz", **{**arrays, "v_template": 2.0 * arrays["v_template"]})
+    np.testing.assert_array_equal(load_body(tmp_path / "a.npz").v_template, 2.0 * first.v_template)
+
+
 def test_expression_directions_are_no_shapes(tmp_path: Path) -> None:
     for columns, shapes in ((400, 16), (20, 10), (12, 12)):
         np.savez(tmp_path / "x.npz", **model_arrays(55, columns, num_vertices=40))
