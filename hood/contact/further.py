@@ -22,7 +22,6 @@ second contact, with which the step is taken to its end again.
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -39,7 +38,7 @@ from hood.mesh.closest_point.search import build_incidence, search_surface
 from hood.mesh.closest_point.tree import Match
 from hood.mesh.penetration.compiled import Eights, eights
 from hood.mesh.penetration.crossing import crossings
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 
 #: Vertices that move less than this [m] past the skin they are matched with are held by its tangent plane.
 LEAST_WAY = 20e-3
@@ -249,13 +248,10 @@ def _by_scene(cloth: Cloth, obstacle: Obstacle) -> list[tuple[Tensor, Tensor]]:
     return [(cloth.faces[(first >= a) & (first < b)], obstacle.faces[obstacle.face_scene == n]) for n, (a, b) in scenes]
 
 
-_Known = tuple[weakref.ref[Tensor], Eights | None]
-_EIGHTS: dict[int, _Known] = {}
-
-
 def _ordered(faces: Tensor, pos: np.ndarray) -> Eights | None:
     """The faces (F, 3) in the order of a search, kept as long as they live."""
-    known = _EIGHTS.get(id(faces))
-    if known is None or known[0]() is not faces:
-        known = _EIGHTS[id(faces)] = weakref.ref(faces, forget(_EIGHTS, id(faces))), eights(faces.cpu().numpy(), pos)
-    return known[1]
+    made = made_of(faces)
+    if "eights" not in made:
+        made["eights"] = eights(faces.cpu().numpy(), pos)
+    found: Eights | None = made["eights"]
+    return found

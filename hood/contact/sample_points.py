@@ -7,7 +7,6 @@ t.
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -20,7 +19,7 @@ from hood.contact.contact import Contact, match_surface
 from hood.mesh import topology
 from hood.mesh.closest_point.search import build_incidence
 from hood.mesh.geometry import normals_of_fans, vertex_masses
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 from hood.tensors.dense import add_rows
 
 #: Where the cloth meets the body: at its vertices alone; at the midpoints of its edges as well; at the midpoints of its rims
@@ -87,23 +86,19 @@ class _Midpoints:
         return _Midpoints(self.vertices[rows], self.share[rows], self.scene[rows], self.rim[rows])
 
 
-_MIDPOINTS: dict[int, tuple[weakref.ref[Cloth], _Midpoints]] = {}
-
-
 def _midpoints(cloth: Cloth) -> _Midpoints:
     """Midpoints of all edges, kept as long as the cloth lives. An edge stands for a third of its faces."""
-    key = id(cloth)
-    if key in _MIDPOINTS and _MIDPOINTS[key][0]() is cloth:
-        return _MIDPOINTS[key][1]
+    made = made_of(cloth)
+    if "midpoints" in made:
+        return made["midpoints"]
     faces, edges = cloth.faces.cpu().numpy(), cloth.edges.cpu().numpy()
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     side = torch.as_tensor(topology.edge_index(edges, sides), device=cloth.faces.device)
     area = add_rows(cloth.rest_area.new_zeros(len(edges)), side, cloth.rest_area.repeat_interleave(3) / 3.0)
     share = area / vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[cloth.edges].mean(dim=1)
     rim = torch.as_tensor(np.bincount(side.cpu().numpy(), minlength=len(edges)) == 1, device=share.device)
-    made = _Midpoints(cloth.edges[:, [0, 1, 1]], share, cloth.edge_scene, rim)
-    _MIDPOINTS[key] = (weakref.ref(cloth, forget(_MIDPOINTS, key)), made)
-    return made
+    found = made["midpoints"] = _Midpoints(cloth.edges[:, [0, 1, 1]], share, cloth.edge_scene, rim)
+    return found
 
 
 def _match_midpoints(place: str, middles: _Midpoints, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:

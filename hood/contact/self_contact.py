@@ -17,7 +17,7 @@ from hood.cloth.cloth import Cloth
 from hood.mesh.closest_point.search import closest_point_on_triangles
 from hood.mesh.cloth_proximity import ClothSurface, Contacts, Followed, LayerMesh, follow, vertex_room
 from hood.mesh.topology import Rings, unique_edges
-from hood.tensors.batch import forget
+from hood.tensors.batch import forget, made_of
 
 #: Beside a face by more than this [m] a vertex is paired with it only where it is the nearest one.
 _BESIDE = 3e-3
@@ -107,22 +107,18 @@ def _heights(pos: np.ndarray, vertex: np.ndarray, corners: np.ndarray) -> tuple[
     return height, np.sqrt(np.maximum(dist**2 - height**2, 0.0)), dist
 
 
-_PATCHES: dict[int, tuple[weakref.ref[Tensor], list[_Patch]]] = {}
-
-
 def _patches(cloth: Cloth) -> list[_Patch]:
     """What is known of every scene, kept as long as the cloth's faces live."""
-    known = _PATCHES.get(id(cloth.faces))
-    if known is not None and known[0]() is cloth.faces:
-        return known[1]
+    made = made_of(cloth.faces)
+    if "patches" in made:
+        return made["patches"]
     rest, faces, scene = cloth.rest_pos.cpu().double().numpy(), cloth.faces.cpu().numpy(), cloth.face_scene.cpu().numpy()
     bounds = torch.searchsorted(cloth.vertex_scene.cpu(), torch.arange(cloth.num_scenes + 1)).tolist()
-    made = [
+    made["patches"] = patches = [
         _Patch(rest[first:last], faces[scene == index] - first, first)
         for index, (first, last) in enumerate(zip(bounds, bounds[1:], strict=False))
     ]
-    _PATCHES[id(cloth.faces)] = weakref.ref(cloth.faces, forget(_PATCHES, id(cloth.faces))), made
-    return made
+    return patches
 
 
 @dataclass(frozen=True)

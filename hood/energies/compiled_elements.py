@@ -7,7 +7,6 @@ and these too where there is no compiler and on an accelerator.
 from __future__ import annotations
 
 import ctypes
-import weakref
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from hood.energies.membrane import Stretching, weave_roots
 from hood.energies.problem import StepProblem
 from hood.native.arguments import COUNT, POINTER, fields
 from hood.native.build import optional
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 
 if TYPE_CHECKING:  # potentials use this pass
     from hood.energies.potential import Potential, Term
@@ -150,17 +149,13 @@ def element_energies(
     return energies
 
 
-#: Constants of cloths, as long as these live.
-_CONSTANTS: dict[int, tuple[weakref.ref[Cloth], _Constants]] = {}
-
-
 def _constants_of(cloth: Cloth) -> _Constants:
-    key = id(cloth)
-    known = _CONSTANTS.get(key)
-    if known is None or known[0]() is not cloth:
-        known = weakref.ref(cloth, forget(_CONSTANTS, key)), _make_constants(cloth)
-        _CONSTANTS[key] = known
-    return known[1]
+    """Kept as long as the cloth lives."""
+    made = made_of(cloth)
+    if "constants" not in made:
+        made["constants"] = _make_constants(cloth)
+    constants: _Constants = made["constants"]
+    return constants
 
 
 def _make_constants(cloth: Cloth) -> _Constants:

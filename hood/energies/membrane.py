@@ -23,7 +23,6 @@ weft, shear → the columns of ``cloth.weave``. The first column of ``cloth.rest
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import replace
 from typing import ClassVar
 
@@ -33,7 +32,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 
 
 def weave_roots(cloth: Cloth, dtype: torch.dtype | None = None) -> Tensor | None:
@@ -137,24 +136,15 @@ class CodedStretching(Stretching):
         return super().__call__(self.prepare(problem), next_pos, acc)
 
 
-#: Cloths that :func:`softened` was asked about and what it made, and those that it made itself, as long as the former live.
-_SOFTENED: dict[int, tuple[weakref.ref[Cloth], Cloth]] = {}
-_MADE: dict[int, weakref.ref[Cloth]] = {}
-
-
 def softened(cloth: Cloth) -> Cloth:
     """The cloth with λ k in place of λ in its energies, one and the same object whenever asked; what it made, itself."""
-    key = id(cloth)
-    made, known = _MADE.get(key), _SOFTENED.get(key)
-    if made is not None and made() is cloth:
-        return cloth
-    if known is not None and known[0]() is cloth:
-        return known[1]
-    # From the fabric at vertices, which stays: a cloth that was softened and then copied is not softened twice.
-    product = cloth.vertex_fabric[:, 1] * cloth.vertex_fabric[:, 2]
-    soft = replace(cloth, lame_lambda=product[cloth.faces].mean(dim=1))
-    _SOFTENED[key] = weakref.ref(cloth, forget(_SOFTENED, key)), soft
-    _MADE[id(soft)] = weakref.ref(soft, forget(_MADE, id(soft)))
+    made = made_of(cloth)
+    if "softened" not in made:
+        # From the fabric at vertices, which stays: a cloth that was softened and then copied is not softened twice.
+        product = cloth.vertex_fabric[:, 1] * cloth.vertex_fabric[:, 2]
+        made["softened"] = soft = replace(cloth, lame_lambda=product[cloth.faces].mean(dim=1))
+        made_of(soft)["softened"] = soft
+    soft = made["softened"]
     return soft
 
 

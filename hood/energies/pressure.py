@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,7 +14,7 @@ from hood.cloth.cloth import Cloth
 from hood.energies.problem import StepProblem, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
 from hood.mesh.topology import boundary_loops, connected_components
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 from hood.tensors.dense import add_rows
 
 #: Pascal, one atmosphere: no garment holds more.
@@ -154,21 +153,17 @@ class Inflation:
         return surface.to_vertices(slope, len(pos)), torch.diag_embed(bound[:, None].expand(-1, 3))
 
 
-#: Surfaces of cloths, as long as their faces live.
-_SURFACES: dict[int, tuple[weakref.ref[Tensor], ClosedSurface]] = {}
-
-
 def surface_of(cloth: Cloth) -> ClosedSurface:
-    """The pieces of a cloth, closed; made once.
+    """The pieces of a cloth, closed; kept as long as its faces live.
 
     Raises:
         ValueError: a piece has no inside.
     """
-    key = id(cloth.faces)
-    known = _SURFACES.get(key)
-    if known is None or known[0]() is not cloth.faces:
-        known = _SURFACES[key] = weakref.ref(cloth.faces, forget(_SURFACES, key)), _closed(cloth)
-    return known[1]
+    made = made_of(cloth.faces)
+    if "closed" not in made:
+        made["closed"] = _closed(cloth)
+    surface: ClosedSurface = made["closed"]
+    return surface
 
 
 def _closed(cloth: Cloth) -> ClosedSurface:

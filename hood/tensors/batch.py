@@ -90,6 +90,23 @@ def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dt
     return made
 
 
+class _Made(dict[str, Any]):
+    """Copies of the owner, in memory or on disk, begin without it."""
+
+    def __deepcopy__(self, memo: Any) -> _Made:
+        return _Made()
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return _Made, ()
+
+
+def made_of(owner: Any) -> dict[str, Any]:
+    """What was made of a tensor or a cloth, by names, kept as long as that lives. It may refer to its owner; in a table of weak
+    references that would keep both for ever."""
+    made: dict[str, Any] = vars(owner).setdefault("_made", _Made())
+    return made
+
+
 def forget(kept: MutableMapping[Any, Any], key: Any) -> Callable[[Any], None]:
     """For :class:`weakref.ref`: takes ``key`` out of ``kept`` when the object is gone; works while Python shuts down, too, when
     the names of modules are gone as well."""

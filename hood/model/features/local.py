@@ -6,7 +6,6 @@ Averages over growing neighbourhoods of a mesh, and the adjoint: long waves out 
 
 from __future__ import annotations
 
-import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import FixedScale
 from hood.model.features.physical import GRAVITY, ContactDistance, Residual, edge_length, mean_rest_length, physical
 from hood.native import features as native
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 from hood.tensors.dense import RowSums
 
 #: Rounds of diffusion of the residuals of small and of large neighbourhoods.
@@ -201,19 +200,16 @@ class _Neighbours(NamedTuple):
         return native.Neighbours(len(self.first) - 1, self.first.data_ptr(), self.other.data_ptr())
 
 
-_NEIGHBOURS: dict[int, tuple[weakref.ref[Tensor], int, _Neighbours]] = {}
-
-
 def neighbours_of(edges: Tensor, num_vertices: int) -> _Neighbours:
     """Neighbours by undirected ``edges`` (E, 2), kept as long as that tensor lives."""
-    key = id(edges)
-    known = _NEIGHBOURS.get(key)
-    if known is not None and known[0]() is edges and known[1] == num_vertices:
-        return known[2]
+    made = made_of(edges)
+    count, known = made.get("neighbours", (None, None))
+    if known is not None and count == num_vertices:
+        return known
     start, end = edges.unbind(dim=1)
     senders, receivers = torch.cat([start, end]), torch.cat([end, start])
     degree = torch.bincount(receivers, minlength=num_vertices)
     first = torch.cat([degree.new_zeros(1), degree.cumsum(0)])
     found = _Neighbours(first, senders[torch.argsort(receivers, stable=True)].contiguous())
-    _NEIGHBOURS[key] = (weakref.ref(edges, forget(_NEIGHBOURS, key)), num_vertices, found)
+    made["neighbours"] = num_vertices, found
     return found

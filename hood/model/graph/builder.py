@@ -3,7 +3,6 @@ cloth that are near each other, and attachments."""
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ from hood.cloth.state import Attachments, Obstacle, StepInput
 from hood.mesh.closest_point.vertices import Nearest
 from hood.mesh.topology import Rings, connected_components
 from hood.model.graph.hierarchy import Hierarchy
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 
 MESH = "mesh"
 BODY = "body"
@@ -324,18 +323,14 @@ def _pairs(pos: np.ndarray, radius: float) -> np.ndarray:
     return np.asarray(found[np.lexsort((found[:, 1], found[:, 0]))])
 
 
-_RESTS: dict[int, tuple[weakref.ref[Tensor], _Rest]] = {}
-
-
 def _rest_of(cloth: Cloth) -> _Rest:
     """Kept as long as the cloth's edges live."""
-    key = id(cloth.edges)
-    known = _RESTS.get(key)
-    if known is not None and known[0]() is cloth.edges:
-        return known[1]
+    made = made_of(cloth.edges)
+    if "rest" in made:
+        return made["rest"]
     edges = cloth.edges.cpu().numpy()
     bounds = torch.searchsorted(cloth.vertex_scene.cpu(), torch.arange(cloth.num_scenes + 1)).tolist()
     count = cloth.num_vertices
     rest = _Rest(cloth.rest_pos.cpu().double().numpy(), connected_components(count, edges), Rings(count, edges), bounds)
-    _RESTS[key] = weakref.ref(cloth.edges, forget(_RESTS, key)), rest
+    made["rest"] = rest
     return rest

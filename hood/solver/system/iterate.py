@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ from hood.energies.term import Role, having
 from hood.mesh.cloth_proximity import EASED
 from hood.solver.derivatives.self_contact import approached, eased, layers_of, limits
 from hood.solver.derivatives.step_terms import StepTerms
-from hood.tensors.batch import forget, to_device
+from hood.tensors.batch import made_of, to_device
 
 
 @dataclass(frozen=True)
@@ -181,16 +180,12 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
     )
 
 
-_DOUBLES: dict[int, tuple[weakref.ref[Cloth], Cloth]] = {}
-
-
 def _double_cloth(cloth: Cloth) -> Cloth:
     """The same cloth in float64, kept as long as the cloth lives."""
-    key = id(cloth)
-    if key in _DOUBLES and _DOUBLES[key][0]() is cloth:
-        return _DOUBLES[key][1]
-    double = to_device(cloth, dtype=torch.float64)
-    _DOUBLES[key] = (weakref.ref(cloth, forget(_DOUBLES, key)), double)
+    made = made_of(cloth)
+    if "double" not in made:
+        made["double"] = to_device(cloth, dtype=torch.float64)
+    double: Cloth = made["double"]
     return double
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +20,7 @@ from hood.solver.derivatives.points import PointBlocks, point_blocks
 from hood.solver.derivatives.self_contact import LayerRows, layer_rows
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.sparsity import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 
 
 class SolverPlan:
@@ -92,20 +91,15 @@ class QuadraticModel:
     layers: LayerRows | None = None  # what cloth near cloth adds; None where there is none
 
 
-_PLANS: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], SolverPlan]] = {}
-
-
 def plan_for(problem: StepProblem) -> SolverPlan:
     """The plan of the problem's cloth, kept as long as the cloth's faces live and nothing it depends on changes."""
     cloth, attachments = problem.cloth, problem.step.attachments
-    now = (cloth.hinges, cloth.free, None if attachments is None else attachments.edges)
-    key = id(cloth.faces)
-    if key in _PLANS:
-        reference, then, plan = _PLANS[key]
-        if reference() is cloth.faces and all(_same(a, b) for a, b in zip(now, then, strict=True)):
-            return plan
-    plan = SolverPlan(cloth, attachments)
-    _PLANS[key] = (weakref.ref(cloth.faces, forget(_PLANS, key)), now, plan)
+    now, made = (cloth.hinges, cloth.free, None if attachments is None else attachments.edges), made_of(cloth.faces)
+    then, plan = made.get("plan", (None, None))
+    if plan is None or not all(_same(a, b) for a, b in zip(now, then, strict=True)):
+        plan = SolverPlan(cloth, attachments)
+        made["plan"] = now, plan
+    assert isinstance(plan, SolverPlan)
     return plan
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from hood.solver.derivatives.elements import FaceModel
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.linear import invert_blocks
 from hood.solver.vertex.cg_step import STEPS, PositiveMatrix, global_step
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 from hood.tensors.conjugate_gradients import Steps
 from hood.tensors.dense import add_rows
 
@@ -125,17 +124,13 @@ def _place(row: int, col: int, size: int = 9) -> int:
     return row * size - row * (row - 1) // 2 + col - row
 
 
-_INCIDENCES: dict[int, tuple[weakref.ref[Tensor], tuple[Tensor, Tensor]]] = {}
-
-
 def incidence_of(cloth: Cloth) -> tuple[Tensor, Tensor]:
     """Corners of faces and hinges by the vertex they are at, kept as long as the cloth's faces live."""
-    key = id(cloth.faces)
-    if key in _INCIDENCES and _INCIDENCES[key][0]() is cloth.faces:
-        return _INCIDENCES[key][1]
+    made = made_of(cloth.faces)
+    if "incidence" in made:
+        return made["incidence"]
     vertex = torch.cat([cloth.faces.t().reshape(-1), cloth.hinges.t().reshape(-1)])
     order = torch.argsort(vertex, stable=True)
     count = vertex.new_zeros(cloth.num_vertices).index_add(0, vertex, torch.ones_like(vertex))
-    value = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
-    _INCIDENCES[key] = (weakref.ref(cloth.faces, forget(_INCIDENCES, key)), value)
+    value = made["incidence"] = (order, torch.cat([count.new_zeros(1), count.cumsum(0)]))
     return value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +20,7 @@ from hood.solver.compiled.system import CompiledScene
 from hood.solver.compiled.tables import build_tables
 from hood.solver.vertex.block_jacobi import LocalTerms, LocalView
 from hood.solver.vertex.cg_step import STEPS
-from hood.tensors.batch import forget
+from hood.tensors.batch import made_of
 from hood.tensors.conjugate_gradients import Steps
 
 _POINTER = ctypes.c_void_p
@@ -86,19 +85,14 @@ def applies(potential: Potential, problem: StepProblem) -> bool:
     return type(pos) is Tensor and pos.dtype == torch.float32 and newton.applies(potential, problem)
 
 
-_Known = tuple[weakref.ref[Tensor], tuple[Tensor, Tensor, Tensor | None], list[CompiledScene]]
-_ENGINES: dict[int, _Known] = {}
-
-
 def _engines_of(cloth: Cloth, attachments: Attachments | None) -> list[CompiledScene]:
     """Engines of a cloth's scenes, apart from those that the solver moves; kept as long as the cloth's faces live."""
-    key, now = id(cloth.faces), (cloth.hinges, cloth.free, None if attachments is None else attachments.edges)
-    known = _ENGINES.get(key)
-    if known is not None and known[0]() is cloth.faces and all(_same(a, b) for a, b in zip(now, known[1], strict=True)):
-        return known[2]
-    made = [CompiledScene(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
-    _ENGINES[key] = (weakref.ref(cloth.faces, forget(_ENGINES, key)), now, made)
-    return made
+    now, made = (cloth.hinges, cloth.free, None if attachments is None else attachments.edges), made_of(cloth.faces)
+    then, engines = made.get("engines", (None, None))
+    if engines is None or not all(_same(a, b) for a, b in zip(now, then, strict=True)):
+        engines = [CompiledScene(cloth, build_tables(cloth, attachments, scene)) for scene in range(cloth.num_scenes)]
+        made["engines"] = now, engines
+    return list(engines)
 
 
 def _same(a: Tensor | None, b: Tensor | None) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,8 @@ from hood.energies.potential import default_potential
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system import plan
 from hood.solver.system.iterate import Unknowns, first_iterate, projected_guess
+from hood.solver.vertex.compiled import local_terms
+from hood.tensors.batch import made_of
 from hood.testing import grid, make_problem, plane_contact
 
 F64 = torch.float64
@@ -89,12 +93,15 @@ def test_accelerations_carry_the_precision(dtype):
     torch.testing.assert_close(unknowns.at(here.pos).phi, here.phi)
 
 
-def test_plans_do_not_outlive_their_cloth():
-    problem = problem_at(0.1)
-    gc.collect()  # those of other tests
-    before = len(plan._PLANS)
-    plan.plan_for(problem)
-    assert len(plan._PLANS) == before + 1
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_what_steps_keep_of_a_cloth_does_not_outlive_it(dtype):
+    """Plans, engines and copies refer to the cloth that they were made of."""
+    problem, potential = problem_at(0.1, dtype=dtype), default_potential()
+    minimize(potential, problem)
+    local_terms(potential, problem)(problem.state.pos)
+    alive = [weakref.ref(problem.cloth.faces), weakref.ref(plan.plan_for(problem))]
+    assert alive[1]() is plan.plan_for(problem)
+    assert "plan" not in made_of(copy.deepcopy(problem.cloth).faces)
     del problem
     gc.collect()
-    assert len(plan._PLANS) == before
+    assert [reference() for reference in alive] == [None, None]
