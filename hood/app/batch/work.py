@@ -7,6 +7,7 @@ in a file; where that process is gone, another one takes the row. Two that make 
 from __future__ import annotations
 
 import errno
+import gc
 import hashlib
 import json
 import os
@@ -77,6 +78,7 @@ def pull(call: Call, rows: Sequence[DataRow], first: int = 0) -> None:
         HopelessError: the disk refuses.
     """
     torch.set_num_threads(1)
+    gc.freeze()
     manifest, done = Manifest(call.folder, call.since), set[str]()
     while True:
         made = 0
@@ -105,6 +107,7 @@ def make_row(call: Call, row: DataRow, claimed: bool = True) -> bool:
             _append(call, _made(call, row, attempt))
         except OSError as error:
             raise HopelessError from error
+        gc.collect()  # tables of large meshes, in few objects
         return True
 
 
