@@ -84,7 +84,7 @@ class BodyParameters:
         return body.surface(sequence, self.betas, torch.float64).numpy() + place[:, None]
 
 
-class PosedBody:
+class BodyWindows:
     """The surface of a body in windows of frames. What is the same in all of them is computed once a body and shape, and a
     window is one product: the matrix (W, 4 J) of weights times rest positions and 1, by the joints' transforms (4 J, 3 N).
 
@@ -119,7 +119,7 @@ class PosedBody:
 
 @lru_cache(maxsize=8)
 def _skin(model: str, gender: str | None, betas: tuple[float, ...], dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of :class:`PosedBody` the matrix, and the joints at rest (J, 3) [m]."""
+    """Of :class:`BodyWindows` the matrix, and the joints at rest (J, 3) [m]."""
     body = _loaded(model, gender)[0]
     rest, joints = body.shaped(np.array(betas))
     factors = body.weights[:, :, None] * np.c_[rest, np.ones(len(rest))][:, None]

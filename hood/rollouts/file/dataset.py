@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hood.assets.files.library import unknown
-from hood.rollouts.file.compact import BodyParameters, PosedBody, PositionTable, read_parameters
+from hood.rollouts.file.compact import BodyParameters, BodyWindows, PositionTable, read_parameters
 
 #: Verdicts of rows of a manifest that have frames.
 _VERDICTS = ("sound", "doubtful", "unsound", "unjudged")
@@ -55,7 +55,7 @@ class _Opened:
     file: h5py.File
     same: dict[str, Any]
     tables: dict[str, PositionTable] = field(default_factory=dict)
-    posed: PosedBody | None = None
+    posed: BodyWindows | None = None
 
     @cached_property
     def body(self) -> BodyParameters | None:
@@ -212,7 +212,7 @@ class RolloutDataset(Dataset[dict[str, Any]]):
             if opened.body is None:
                 return {"body_pos": self._tensor(self._positions(number, opened, "body", start, stop))}
             if opened.posed is None:
-                opened.posed = PosedBody(opened.body, torch.float64 if self.dtype == torch.float64 else torch.float32)
+                opened.posed = BodyWindows(opened.body, torch.float64 if self.dtype == torch.float64 else torch.float32)
             joints = self._chunks((number, "joints"), opened.posed.chunk, opened.posed.joints, start, stop)
             return {"body_pos": opened.posed.surface(joints, start).to(self.dtype).contiguous()}
         if opened.body is None:
