@@ -57,7 +57,7 @@ def main(motions: str = "plie,walk_steady,squats,twists,walk_proud", num_frames:
     if code := command(["dress", *words, "output=outputs/learn"]):
         raise SystemExit(code)
     unseen = motions.split(",")[-1]
-    train = hood.RolloutDataset("outputs/learn", window=4, body="pos", where=lambda row: not row["row"].endswith(unseen))
+    train = hood.RolloutDataset("outputs/learn", window=4, body="pos", where=lambda row: not row["row"].endswith(f"/{unseen}"))
     test = hood.RolloutDataset("outputs/learn", window=4, body="pos", rows=[f"*/{unseen}"])
     batches = hood.RolloutBatches(train, batch_size=4)
     torch.manual_seed(0)

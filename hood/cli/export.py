@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -139,6 +140,9 @@ def _rollouts_in(source: Path, verdict: Sequence[str]) -> list[Path]:
     if (source / "rollout.h5").exists():
         return [source / "rollout.h5"]
     found = sorted(path for path in source.rglob("*") if path.suffix in _PICKLES)
+    twice = next((a for a, b in pairwise(found) if a.with_suffix("") == b.with_suffix("")), None)
+    if twice is not None:
+        raise ConfigError(f"{twice}: another pickle beside it has this name; rename one")
     if not found:
         raise ConfigError(
             f"rollout={source}: has no manifest.jsonl of hood dress, no rollout.h5 and no .pkl; name another folder"
@@ -167,7 +171,10 @@ def _convert_one(source: Path, target: Path, fps: float | None) -> int:
         write_rollout(prepare_folder(target.parent) / target.name, data)
     else:
         data = read_rollout(source)
-        write_atomically(prepare_folder(target.parent) / target.name, published_bytes(source, data))
+        if not bool(data.attributes.get("complete", True)):
+            print(f"{source}: is not finished; {len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there")
+        content = published_bytes(source, data)
+        write_atomically(prepare_folder(target.parent) / target.name, content)
     print(f"{source}: {len(data.time)} frames of {data.cloth_pos.shape[1]} vertices, {1 / data.attributes['dt']:g} fps")
     return len(data.time)
 
@@ -175,7 +182,6 @@ def _convert_one(source: Path, target: Path, fps: float | None) -> int:
 @contextmanager
 def _new(target: Path) -> Iterator[Path]:
     """A place beside ``target`` for what takes its name when it is whole, and is removed where it does not become so."""
-    prepare_folder(target.parent)
     draft = target.with_name(f".partial.{target.name}")
     remove_whole(draft)
     try:

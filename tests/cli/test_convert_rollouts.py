@@ -197,6 +197,7 @@ def test_pickles_that_cannot_be_used_are_named_and_leave_nothing(
         (["rollout=empty", "output=x"], "rollout=empty: has no manifest.jsonl of hood dress, no rollout.h5 and no .pkl"),
         (["rollout=walk.pkl", "output=walk.txt"], "output=walk.txt: name a file that ends in .h5"),
         (["rollout=walk.pkl", "output=there.h5"], "output=there.h5: is there already; name a file that is new"),
+        (["rollout=twice", "output=x"], "twice/a.pickle: another pickle beside it has this name"),
         (["rollout=set"], "output is not given: the folder for the files of rollout=set"),
         (["rollout=set", "output=full"], "output=full: is there already; name a folder that is new"),
         (["rollout=set", "output=x", "verdict=[fine]"], "unknown verdict 'fine'"),
@@ -212,7 +213,7 @@ def test_pickles_that_cannot_be_used_are_named_and_leave_nothing(
 def test_words_that_cannot_be_meant_are_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     save(Path("walk.pkl"), published())
     dress_set(Path("set"))
-    for name in ("walk.txt", "there.h5", "full/file"):
+    for name in ("walk.txt", "there.h5", "full/file", "twice/a.pkl", "twice/a.pickle"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("something")
     Path("empty").mkdir()
@@ -224,11 +225,27 @@ def test_words_that_cannot_be_meant_are_refused(words: list[str], said: str, cap
     assert sorted(Path().rglob("*")) == before
 
 
+def test_a_rollout_without_a_body_that_is_not_finished(capsys: pytest.CaptureFixture[str]) -> None:
+    pos, faces = grid(4, 4)
+    target = RolloutWriter(Path("rollout.h5"), 3, pos, faces, faces[:0], 0, ("ms",), 0.04, {})
+    target.append(pos, np.zeros((0, 3)), {"ms": 1.0})
+    assert main(["convert", "rollout=rollout.h5"]) == 0
+    assert "rollout.h5: is not finished; 1 of 3 frames are there" in capsys.readouterr().out
+    target.close(False)
+    content = pickle.loads(Path("rollout.pkl").read_bytes())
+    save(Path("bare.pkl"), content | {"obstacle_faces": np.zeros((0, 3))})
+    assert main(["convert", "rollout=bare.pkl"]) == 0
+    data = hood.read_rollout("bare.h5")
+    np.testing.assert_array_equal(data.cloth_pos, pos[None].astype(np.float32))
+    assert data.body_pos.shape == (1, 0, 3)
+
+
 def test_frames_that_are_not_finite_are_not_published(capsys: pytest.CaptureFixture[str]) -> None:
     pos, faces = grid(4, 4)
     with RolloutWriter(Path("rollout.h5"), 2, pos, faces, faces[:0], 0, (), 0.04, {}) as target:
         target.append(pos, np.zeros((0, 3)), {})
         target.append(np.full_like(pos, np.nan), np.zeros((0, 3)), {})
-    assert main(["convert", "rollout=rollout.h5", "output=out.pkl"]) == 2
+    assert main(["convert", "rollout=rollout.h5", "output=new/out.pkl"]) == 2
     assert "rollout.h5: cloth/pos has numbers that are not finite from frame 1 on" in capsys.readouterr().err
+    assert not Path("new").exists()
     assert [path.name for path in Path().iterdir()] == ["rollout.h5"]

@@ -202,7 +202,8 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         return self._meshes[key]
 
     def _tensor(self, values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self.dtype)
+        """A copy: items may be changed, chunks that are kept may not."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.dtype, copy=True)
 
     def _body(self, number: int, opened: _Opened, start: int, stop: int) -> dict[str, Tensor]:
         """What an item has of the body."""

@@ -293,7 +293,7 @@ def _points(path: Path, key: str, value: Any, axes: int) -> np.ndarray:
 
 def _triangles(path: Path, key: str, content: Mapping[str, Any], num_vertices: int) -> np.ndarray:
     found = np.asarray(content[key])
-    right = found.dtype.kind in "iu" and found.ndim == 2 and found.shape[1] == 3
+    right = (found.dtype.kind in "iu" or not found.size) and found.ndim == 2 and found.shape[1] == 3
     if not right or (found.size and not 0 <= found.min() <= found.max() < num_vertices):
         what = (
             f"is {found.shape} of {found.dtype}"

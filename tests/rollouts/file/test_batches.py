@@ -114,6 +114,14 @@ def test_a_worker_unpacks_a_chunk_once(folder: Path, workers: int, monkeypatch: 
     assert len(reads) == len({*reads}) > 0
 
 
+def test_items_may_be_changed(folder: Path) -> None:
+    data = RolloutDataset(folder)
+    before = data[3]["cloth_pos"].clone()
+    data[3]["cloth_pos"].zero_()
+    assert torch.equal(data[3]["cloth_pos"], before)
+    assert before.abs().max() > 0
+
+
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where the tests have one processor
 def test_a_loader_with_workers_reads_the_same(folder: Path) -> None:
     data = RolloutDataset(folder, window=2)
