@@ -41,6 +41,7 @@ _HOMES = {
     "default_potential": "hood.energies.potential",
     "RolloutData": "hood.rollouts.file.reader",
     "read_rollout": "hood.rollouts.file.reader",
+    "RolloutBatches": "hood.rollouts.file.batches",
     "RolloutDataset": "hood.rollouts.file.dataset",
     "load_reference_checkpoint": "hood.steppers.published",
 }

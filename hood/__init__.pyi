@@ -15,6 +15,7 @@ from hood.assets.material import EdgeField as EdgeField, FaceField as FaceField,
 from hood.assets.motion.load import load_sequence as load_sequence
 from hood.assets.motion.animated_mesh import BodyMesh as BodyMesh
 from hood.assets.motion.sequence import PoseSequence as PoseSequence
+from hood.rollouts.file.batches import RolloutBatches as RolloutBatches
 from hood.rollouts.file.dataset import RolloutDataset as RolloutDataset
 from hood.rollouts.file.reader import RolloutData as RolloutData, read_rollout as read_rollout
 from hood.steppers.published import load_reference_checkpoint as load_reference_checkpoint

@@ -39,6 +39,7 @@ MODULES = {
     "hood/rollouts/checks/guard.py": "what the guard measures, its alarms and its repair decide together",
     "hood/rollouts/file/compact.py": "one layout: positions in steps, the body as parameters, how both are written and read",
     "hood/rollouts/file/dataset.py": "one class: its arguments, its items, its files in every worker",
+    "hood/rollouts/file/reader.py": "whole rollouts from files: our own, and those of the published code with the way back",
     "hood/rollouts/file/recorder.py": "the writer of `rollout.h5` and the layout that it shares with the reader",
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",

@@ -63,7 +63,11 @@ _EXAMPLES = {
         "hood prepare garment=[shirt.obj,trousers.glb] pins=waistband output=outfit.npz",
         "hood prepare garment=suit.obj pose=CMU_01_poses.npz frame=0 output=suit.npz",
     ],
-    "convert": ["hood convert checkpoint=postcvpr.pth output=postcvpr.safetensors"],
+    "convert": [
+        "hood convert checkpoint=postcvpr.pth output=postcvpr.safetensors",
+        "hood convert rollout=walk.pkl output=walk.h5",
+        "hood convert rollout=outputs/set output=published",
+    ],
     "evaluate": [
         "hood evaluate",
         "hood evaluate models=[runs/a/model.safetensors,newton] garments=[dress] sequences=[] gap_states=3",

@@ -41,7 +41,7 @@ COMMANDS = {
     "evaluate": "measure cost and accuracy of networks and of the solver, as a table",
     "tradeoff": "measure time against accuracy for many settings, as a chart",
     "envelope": "measure where each method holds and fails, in extreme scenes, as a map",
-    "convert": "write published HOOD weights (.pth) as a model file",
+    "convert": "write published HOOD weights (.pth) and rollouts (.pkl) as files of this library, and rollouts back",
 }
 
 #: Where each of them lives; the others, and those of installed packages, are registered (:mod:`hood.plugins`).

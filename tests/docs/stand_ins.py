@@ -41,7 +41,9 @@ class Desk:
         self.workshop.folder.mkdir()
         self.go = go
         self.makers: list[tuple[str, Callable[[str, Sequence[str]], Path]]] = [
-            (r"(outputs/(?!plan/)\w+|(.*/)?rollout\.h5)", self.rollout),
+            (r"outputs/set", self.data_set),
+            (r"(outputs/(?!plan/|set$)\w+|(.*/)?rollout\.h5)", self.rollout),
+            (r"walk\.pkl", self.published_rollout),
             (r"long\.h5", self.long_rollout),
             (r"outputs/plan/plan\.json", self.plan),
             (r"([\w/]+/)?\w+\.safetensors", self.model),
@@ -95,6 +97,22 @@ class Desk:
 
         made = self._once("rollout", make) / "made"
         return made / "rollout.h5" if name.endswith(".h5") else made
+
+    def data_set(self, name: str, words: Sequence[str]) -> Path:
+        """What ``hood dress`` leaves of one row."""
+
+        def make(folder: Path) -> None:
+            shutil.copytree(self.rollout("outputs/row", words), folder / "made" / "dress" / "plie")
+            line = '{"row": "dress/plie", "verdict": "sound", "settings": {}}\n'
+            (folder / "made" / "manifest.jsonl").write_text(line, encoding="utf-8")
+
+        return self._once("data set", make) / "made"
+
+    def published_rollout(self, name: str, words: Sequence[str]) -> Path:
+        def make(folder: Path) -> None:
+            assert main(["convert", f"rollout={self.rollout('outputs/row', words)}", "output=walk.pkl"]) == 0
+
+        return self._once("published rollout", make) / "walk.pkl"
 
     def long_rollout(self, name: str, words: Sequence[str]) -> Path:
         """Ninety frames of a tube about a ball."""

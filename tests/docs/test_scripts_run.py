@@ -115,6 +115,7 @@ NOT_RUN = {
     r"gallery\.py": "21 rollouts of 60 frames at 4,000 vertices",
     r"gpu(_checks)?\.py": "needs a CUDA device",
     r"heads\.py (controls|models)": "reads networks that benchmarks/recipes.py trains in hours",
+    r"learn_motion\.py": "simulates and trains for a minute; tests/scripts runs it in small",
     r"kills\.py": "starts and kills trainings for minutes; tests/training/test_kills.py does so once",
     r"minima\.py": "a hundred minimisations to the end, minutes",
     r"order\.py": "trains three networks for half an hour, or minimises hundreds of steps to the end",

@@ -25,10 +25,12 @@ from hood.app.batch.manifest import (
     VERDICTS,
     Line,
     Manifest,
+    check_parquet,
     mend_manifest,
     open_rows,
     read_manifest,
     require_same_rows,
+    write_parquet,
 )
 from hood.app.batch.rows import AXES, DataRow, rows_of
 from hood.app.batch.work import Call, cause_of, clear, settings_of, silently
@@ -134,6 +136,8 @@ def _work(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow], fol
     clear(folder)
     if int(config.thumbnails) and not interrupted and (left or not (folder / _THUMBNAILS).exists()):
         _draw_rows(config, lines, folder)
+    if bool(config.parquet):
+        write_parquet(folder)
     code = 130 if interrupted else _conclude(config, lines, len(rows), folder, fail_on)
     return Dressed(lines, len(rows), interrupted, code)
 
@@ -165,6 +169,7 @@ def _check(config: DictConfig) -> None:
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
     output_folder(config)
+    check_parquet(bool(config.parquet))
     check_engine(config)
 
 

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import importlib
+import importlib.util
+import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,7 +19,9 @@ from typing import Any
 
 from hood.app.batch.rows import DataRow
 from hood.app.settings.compose import ConfigError, brief
+from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate
+from hood.assets.files.said import install
 
 Line = dict[str, Any]
 #: A row's own line, in its folder.
@@ -86,6 +91,31 @@ def _line_of(text: bytes) -> Line | None:
 def read_manifest(folder: Path) -> dict[str, Line]:
     """The last line of every row in an output folder; empty where there is no manifest."""
     return {line["row"]: line for line in Manifest(folder).new()}
+
+
+def check_parquet(wanted: bool) -> None:
+    """Raise ConfigError where ``manifest.parquet`` is ``wanted`` and the package that writes it is not there."""
+    if wanted and importlib.util.find_spec("pyarrow") is None:
+        raise ConfigError(f"parquet=true needs the package pyarrow: {install('parquet')}")
+
+
+def parquet_columns(lines: Iterable[Line]) -> dict[str, list[Any]]:
+    """A column a key of any line, None where a line lacks it: of tables one a key, ``settings.garment``; lists are JSON."""
+    rows = []
+    for line in lines:
+        tables = {key: value for key, value in line.items() if isinstance(value, dict)}
+        flat = {key: value for key, value in line.items() if key not in tables}
+        flat |= {f"{key}.{name}": value for key, table in tables.items() for name, value in table.items()}
+        rows.append({key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in flat.items()})
+    return {key: [row.get(key) for row in rows] for key in dict.fromkeys(key for row in rows for key in row)}
+
+
+def write_parquet(folder: Path) -> None:
+    """Write the last line of every row of an output folder as ``manifest.parquet``."""
+    content = io.BytesIO()
+    table = importlib.import_module("pyarrow").table(parquet_columns(read_manifest(folder).values()))
+    importlib.import_module("pyarrow.parquet").write_table(table, content)
+    write_atomically(folder / "manifest.parquet", content.getvalue())
 
 
 def own_line(folder: Path) -> Line | None:

@@ -31,12 +31,11 @@ from hood.assets.garment.garment import Garment, garment_of_mesh, load_garment, 
 from hood.assets.garment.pins import opening_names
 from hood.assets.garment.record import Fitting, Wanted, start_fitting
 from hood.assets.motion.sequence_edit import arms_down
-from hood.assets.pickles.unpickle import load_pickle
 from hood.cli.inspect.garment import describe_made, describe_objects, describe_place, place_beside_mesh, problems_of
 from hood.mesh.editing.quality import check_triangles
 from hood.mesh.editing.repair import Defects, find_defects
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.file.reader import read_rollout
+from hood.rollouts.file.reader import read_published, read_rollout
 from hood.rollouts.verdict.frames import worst_frame
 from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
@@ -350,9 +349,10 @@ def _tell_progress(finding: Finding, path: Path, done: int, planned: Any) -> Non
 
 
 def inspect_pickle(name: str, kind: str) -> Finding:
-    """A file that is known but not run: its keys."""
-    content = load_pickle(name)
-    return Finding(name, kind, {"keys": sorted(map(str, content))[:20]})
+    """A rollout of the published code: what of it there is, and how it becomes a rollout of this one."""
+    data, _ = read_published(Path(name))
+    sizes = {"frames": len(data.time), "cloth vertices": data.cloth_pos.shape[1], "body vertices": data.body_pos.shape[1]}
+    return Finding(name, kind, {**sizes, "metrics": sorted(data.metrics), "to use it": f"hood convert rollout={name}"})
 
 
 def inspect_list(name: str) -> Finding:

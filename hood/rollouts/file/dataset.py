@@ -19,14 +19,16 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hood.assets.files.library import unknown
-from hood.rollouts.file.compact import BodyParameters, PositionTable, read_parameters
+from hood.rollouts.file.compact import BodyParameters, BodyWindows, PositionTable, read_parameters
 
 #: Verdicts of rows of a manifest that have frames.
 _VERDICTS = ("sound", "doubtful", "unsound", "unjudged")
 #: What an item may have of the body.
 _BODIES = ("none", "pos", "parameters")
-#: Chunks of frames that a process keeps unpacked.
-_CHUNKS = 16
+#: Bytes of unpacked chunks of frames that a process keeps.
+_KEPT = 64 << 20
+#: Settings of a row that do not change the mesh of its garment.
+_NOT_OF_MESH = ("seed", "name", "sequence", "material", "body")
 
 
 class ClothMesh(NamedTuple):
@@ -38,11 +40,12 @@ class ClothMesh(NamedTuple):
 
 @dataclass(frozen=True)
 class _Source:
-    """One rollout: its file, what it is called, and its frames."""
+    """One rollout: its file, what it is called, its frames, and the settings that its mesh follows from, where known."""
 
     path: Path
     name: str
     frames: int
+    settings: str | None = None
 
 
 @dataclass
@@ -52,6 +55,7 @@ class _Opened:
     file: h5py.File
     same: dict[str, Any]
     tables: dict[str, PositionTable] = field(default_factory=dict)
+    posed: BodyWindows | None = None
 
     @cached_property
     def body(self) -> BodyParameters | None:
@@ -75,8 +79,8 @@ class RolloutDataset(Dataset[dict[str, Any]]):
     | ``name``, ``garment`` | row of the manifest, or the file; the garment's name |
     | ``fabric`` | its constants by name: ``density`` [kg/m²], ``lame_mu``, ``lame_lambda`` [Pa], … |
 
-    :meth:`mesh` gives faces and rest positions of a rollout. Batches of several garments need a ``batch_size`` of None or a
-    sampler that keeps garments apart: their numbers of vertices differ.
+    :meth:`mesh` gives faces and rest positions of a rollout. :class:`hood.RolloutBatches` makes batches of one garment each, in
+    an order that is fast to read.
 
     Files are opened when they are read, by every worker for itself; at most ``open_files`` stay open. The data set can be
     pickled, and workers may be forked or spawned. Reading the compact layouts
@@ -171,6 +175,23 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         item |= self._body(number, opened, start, stop)
         return item | opened.same | {"frame": start, "rollout": number, "name": self._sources[number].name}
 
+    def windows(self, rollout: int) -> range:
+        """The items of a rollout, by its number."""
+        return range(int(self._ends[rollout - 1]) if rollout else 0, int(self._ends[rollout]))
+
+    @cached_property
+    def graphs(self) -> list[int]:
+        """Of the rollouts, by their number: the first of them that has the same faces. Of rows whose garment was made with the
+        same settings from the same file, one is read."""
+        found: dict[str | int, int] = {}
+        first: dict[bytes, int] = {}
+        for number, source in enumerate(self._sources):
+            key = number if source.settings is None else source.settings
+            if key not in found:
+                cloth = self._open(number).file["cloth"]
+                found[key] = first.setdefault(cloth["faces"][:].tobytes() + b"%d" % len(cloth["rest_pos"]), number)
+        return [found[number if one.settings is None else one.settings] for number, one in enumerate(self._sources)]
+
     def mesh(self, rollout: int) -> ClothMesh:
         """Faces and rest positions of the cloth of a rollout, by its number; equal ones are shared."""
         file = self._open(rollout).file
@@ -181,7 +202,8 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         return self._meshes[key]
 
     def _tensor(self, values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self.dtype)
+        """A copy: items may be changed, chunks that are kept may not."""
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.dtype, copy=True)
 
     def _body(self, number: int, opened: _Opened, start: int, stop: int) -> dict[str, Tensor]:
         """What an item has of the body."""
@@ -190,7 +212,10 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         if self.body == "pos":
             if opened.body is None:
                 return {"body_pos": self._tensor(self._positions(number, opened, "body", start, stop))}
-            return {"body_pos": self._tensor(opened.body.surfaces(opened.body.find(), start, stop))}
+            if opened.posed is None:
+                opened.posed = BodyWindows(opened.body, torch.float64 if self.dtype == torch.float64 else torch.float32)
+            joints = self._chunks((number, "joints"), opened.posed.chunk, opened.posed.joints, start, stop)
+            return {"body_pos": opened.posed.surface(joints, start).to(self.dtype).contiguous()}
         if opened.body is None:
             raise ValueError(f"{self._sources[number].path}: has the body's vertices, not its parameters; give body='pos'")
         moved = opened.body.sequence
@@ -208,18 +233,24 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         if part not in opened.tables:
             opened.tables[part] = PositionTable(opened.file, part)
         table = opened.tables[part]
-        length = table.chunk
-        if length is None:
+        if table.chunk is None:
             return table.read(start, stop)
+        return self._chunks((number, part), table.chunk, table.read, start, stop)
+
+    def _chunks(
+        self, key: tuple[int, str], length: int, read: Callable[[int, int], np.ndarray], start: int, stop: int
+    ) -> np.ndarray:
+        """Rows ``start`` to ``stop`` of what ``read(start, stop)`` gives in chunks of ``length`` rows, which are kept."""
         pieces = []
         for chunk in range(start // length, -(-stop // length)):
-            key = (number, part, chunk)
-            if key not in self._unpacked:
-                self._unpacked[key] = table.read(chunk * length, (chunk + 1) * length)
-            self._unpacked.move_to_end(key)
-            pieces.append(self._unpacked[key][max(0, start - chunk * length) : stop - chunk * length])
-        while len(self._unpacked) > _CHUNKS:
-            self._unpacked.popitem(last=False)
+            place = (*key, chunk)
+            if place not in self._unpacked:
+                self._unpacked[place] = read(chunk * length, (chunk + 1) * length)
+                self._kept += self._unpacked[place].nbytes
+            self._unpacked.move_to_end(place)
+            pieces.append(self._unpacked[place][max(0, start - chunk * length) : stop - chunk * length])
+        while self._kept > _KEPT:
+            self._kept -= self._unpacked.popitem(last=False)[1].nbytes
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def _open(self, number: int) -> _Opened:
@@ -239,6 +270,7 @@ class RolloutDataset(Dataset[dict[str, Any]]):
         self._owner = os.getpid()
         self._files: OrderedDict[int, _Opened] = OrderedDict()
         self._unpacked: OrderedDict[tuple[int, str, int], np.ndarray] = OrderedDict()
+        self._kept = 0
         self._meshes: dict[bytes, ClothMesh] = {}
         self._same: dict[int, dict[str, Any]] = {}  # of files that were open before
 
@@ -320,8 +352,16 @@ def _of_manifest(
         counts = Counter(str(line["verdict"]) for line in lines.values())
         found = ", ".join(f"{count} {word}" for word, count in counts.items()) or "no row"
         raise ValueError(f"{path}: no row is taken; it has {found}: give other verdicts, rows or where")
-    found_frames = {name: int(line.get("stored_frames", -1)) for name, line in taken.items()}
-    files = {name: path.parent / name / "rollout.h5" for name in taken}
-    return [
-        _Source(files[name], name, count if count >= 0 else _frames_in(files[name])) for name, count in found_frames.items()
-    ]
+    sources = []
+    for name, line in taken.items():
+        file, count = path.parent / name / "rollout.h5", int(line.get("stored_frames", -1))
+        sources.append(_Source(file, name, count if count >= 0 else _frames_in(file), _mesh_settings(line)))
+    return sources
+
+
+def _mesh_settings(line: Mapping[str, Any]) -> str | None:
+    """The settings that the mesh of a row follows from, with the digest of its garment; None where they are not known."""
+    settings, digest = line.get("settings"), (line.get("inputs") or {}).get("garment", "none")
+    if not isinstance(settings, dict) or digest == "none":
+        return None
+    return json.dumps([digest, sorted((key, value) for key, value in settings.items() if key not in _NOT_OF_MESH)])

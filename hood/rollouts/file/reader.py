@@ -1,7 +1,14 @@
-"""Reads the file of a rollout, whole and checked."""
+"""Reads the file of a rollout, whole and checked.
+
+Rollouts as the published HOOD code writes them: a pickle of a dictionary, in and out.
+"""
 
 from __future__ import annotations
 
+import io
+import pickle
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +17,13 @@ import h5py
 import numpy as np
 
 from hood.assets.body.body import Body
-from hood.assets.files.guarded import own_dataset
+from hood.assets.files.guarded import listed, own_dataset
+from hood.assets.pickles.content import load_content
 from hood.rollouts.file.compact import PositionTable, body_reader, check_compact, compact_paths, is_compact, most_bytes
 from hood.rollouts.file.recorder import (
     ALARM_COLUMNS,
     STEP_COLUMNS,
+    RolloutWriter,
     _alarm_paths,
     _field_paths,
     _frames_there,
@@ -202,3 +211,156 @@ def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
 
 def _words(values: np.ndarray) -> list[str]:
     return [value.decode("utf-8", "replace") for value in values.tolist()]
+
+
+# ---- the published layout --------------------------------------------------------------------------------------------
+
+#: Keys of the dictionary. Ours hold ``rest_pos`` (V, 3) m and ``dt`` s beside them, which the published code passes over.
+_PUBLISHED = ("pred", "obstacle", "cloth_faces", "obstacle_faces")
+
+
+def read_published(path: Path, fps: float | None = None) -> tuple[RolloutData, list[str]]:
+    """A rollout of the published HOOD code, a pickle of ``pred`` (T, V, 3) m, ``obstacle`` (T, W, 3) m, ``cloth_faces`` (F, 3),
+    ``obstacle_faces`` (G, 3) and ``metrics``. No class is unpickled.
+
+    Args:
+        path: the file.
+        fps: frames per second; None: what the file says, else 30, as those of the published code have.
+
+    Returns:
+        The rollout, and sentences on what the file does not say.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it cannot be used; names the file and the key.
+    """
+    content = load_content(path)
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{path}: holds no dictionary; a published rollout is one of {', '.join(_PUBLISHED)}, metrics")
+    missing = [key for key in _PUBLISHED if key not in content]
+    if missing:
+        found = listed(map(str, content))
+        raise ValueError(f"{path}: has no {' and no '.join(missing)}, but {found}; give a rollout of the published code")
+    pos = {key: _points(path, key, content[key], 3) for key in _PUBLISHED[:2]}
+    count = len(pos["pred"])
+    if count == 0 or len(pos["obstacle"]) != count:
+        raise ValueError(f"{path}: pred has {count} frames and obstacle {len(pos['obstacle'])}; they need as many, and some")
+    faces = {f"{key}_faces": _triangles(path, f"{key}_faces", content, pos[of].shape[1]) for key, of in _OF_FACES.items()}
+    dt = _duration(path, content.get("dt", 1 / 30)) if fps is None else 1.0 / fps
+    said = []
+    rest_pos = pos["pred"][0]
+    if "rest_pos" in content:
+        rest_pos = _points(path, "rest_pos", content["rest_pos"], 2)
+    else:
+        said.append(f"{path}: has no rest_pos; strains are from the cloth's shape in frame 0")
+    metrics, left_out = _published_metrics(content.get("metrics"), count)
+    if left_out:
+        said.append(f"{path}: metrics that are not one number a frame are left out: {listed(left_out)}")
+    if len(rest_pos) != pos["pred"].shape[1]:
+        raise ValueError(f"{path}: rest_pos {rest_pos.shape} does not belong to pred {pos['pred'].shape}; leave it out")
+    time, attributes = np.arange(count) * dt, {"dt": dt, "garment": path.stem, "source": path.name}
+    data = RolloutData(
+        *(pos["pred"], faces["cloth_faces"], rest_pos, pos["obstacle"], faces["obstacle_faces"], time, metrics, attributes)
+    )
+    return data, said
+
+
+_OF_FACES = {"cloth": "pred", "obstacle": "obstacle"}
+
+
+def _duration(path: Path, value: Any) -> float:
+    """``dt`` of a published rollout [s]."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "fiu" or found.size != 1 or not 0 < float(found.item()) < np.inf:
+        raise ValueError(f"{path}: dt is {str(value)[:40]!r}; it has to be seconds above 0, or give fps=")
+    return float(found.item())
+
+
+def _points(path: Path, key: str, value: Any, axes: int) -> np.ndarray:
+    """Positions [m] with so many axes, in float32 unless they are in float64."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # frames of several sizes
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "fiu" or found.ndim != axes or found.shape[-1] != 3:
+        shape = ("(frames, vertices, 3)", "(vertices, 3)")[axes == 2]
+        raise ValueError(f"{path}: {key} is {found.shape} of {found.dtype}; it has to be {shape} of numbers, in metres")
+    if not np.isfinite(found).all():
+        place = "" if axes == 2 else f" from frame {int(np.argmin(np.isfinite(found).all(axis=(1, 2))))} on"
+        raise ValueError(f"{path}: {key} has numbers that are not finite{place}; leave those frames out")
+    return found if found.dtype == np.float64 else found.astype(np.float32)
+
+
+def _triangles(path: Path, key: str, content: Mapping[str, Any], num_vertices: int) -> np.ndarray:
+    found = np.asarray(content[key])
+    right = (found.dtype.kind in "iu" or not found.size) and found.ndim == 2 and found.shape[1] == 3
+    if not right or (found.size and not 0 <= found.min() <= found.max() < num_vertices):
+        what = (
+            f"is {found.shape} of {found.dtype}"
+            if not right
+            else f"names vertex {found.min() if found.min() < 0 else found.max()}"
+        )
+        raise ValueError(f"{path}: {key} {what}; it has to be (faces, 3) of vertices from 0 to {num_vertices - 1}")
+    return found.astype(np.int32)
+
+
+def _published_metrics(value: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Those with a number a frame, or from frame 1 on; and the names of the others."""
+    found, left_out = dict[str, np.ndarray](), list[str]()
+    for name, values in (value if isinstance(value, Mapping) else {}).items():
+        plain = re.sub(r"[^\w.-]", "_", str(name)).strip(".")
+        try:
+            numbers = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            numbers = np.empty(0)
+        if plain and plain not in found and numbers.shape in ((count,), (count - 1,)):
+            found[plain] = np.concatenate([np.full(count - len(numbers), np.nan), numbers])
+        else:
+            left_out.append(str(name))
+    return found, left_out
+
+
+def write_rollout(path: Path, data: RolloutData) -> None:
+    """Write positions, meshes, metrics and attributes of a rollout as ``rollout.h5``; of other tables none.
+
+    Raises:
+        OSError: it cannot be written; nothing stays behind.
+    """
+    farthest = max(float(np.abs(pos).max(initial=0.0)) for pos in (data.cloth_pos, data.body_pos))
+    arguments = (len(data.time), data.rest_pos, data.cloth_faces, data.body_faces, data.body_pos.shape[1], (*data.metrics,))
+    attributes = {key: value for key, value in data.attributes.items() if key != "dt"}
+    double = data.cloth_pos.dtype == np.float64
+    with RolloutWriter(path, *arguments, float(data.attributes["dt"]), attributes, farthest, double=double) as target:
+        for frame, (cloth, body) in enumerate(zip(data.cloth_pos, data.body_pos, strict=True)):
+            target.append(cloth, body, {name: values[frame] for name, values in data.metrics.items()})
+
+
+def published_bytes(path: Path, data: RolloutData) -> bytes:
+    """The pickle of a rollout, which ``path`` holds, in the published layout: a dictionary of arrays that plain ``pickle.load``
+    reads with numpy from 1.17 on; positions in float32.
+
+    Raises:
+        ValueError: it has no frames, or positions that are not finite.
+    """
+    pos = {"pred": _points(path, "cloth/pos", data.cloth_pos, 3), "obstacle": _points(path, "body/pos", data.body_pos, 3)}
+    if not len(data.time):
+        raise ValueError(f"{path}: holds no frames; run hood rollout again")
+    content: dict[str, Any] = {key: value.astype(np.float32) for key, value in pos.items()}
+    content |= {"cloth_faces": data.cloth_faces.astype(np.int64), "obstacle_faces": data.body_faces.astype(np.int64)}
+    content |= {"metrics": data.metrics, "rest_pos": data.rest_pos.astype(np.float32)}
+    file = io.BytesIO()
+    _Pickler(file, protocol=4).dump(content | {"dt": np.array(float(data.attributes["dt"]))})
+    return file.getvalue()
+
+
+class _Pickler(pickle._Pickler):  # type: ignore[name-defined,misc]
+    """Names numpy's parts as numpy 1 does, which numpy 2 reads too."""
+
+    def save_global(self: Any, obj: Any, name: str | None = None) -> None:
+        """Write the name of what an array is made by."""
+        module = str(getattr(obj, "__module__", ""))
+        if not module.startswith("numpy._core"):
+            pickle._Pickler.save_global(self, obj, name)  # type: ignore[attr-defined]
+            return
+        self.write(pickle.GLOBAL + f"{module.replace('numpy._core', 'numpy.core')}\n{name or obj.__qualname__}\n".encode())
+        self.memoize(obj)

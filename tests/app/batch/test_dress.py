@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import importlib
+import importlib.util
 import json
 import multiprocessing
 import os
@@ -20,7 +22,7 @@ import pytest
 
 from hood.app.batch import engines, work
 from hood.app.batch.dress import _frames_of
-from hood.app.batch.manifest import Manifest, own_line, read_manifest
+from hood.app.batch.manifest import Manifest, own_line, parquet_columns, read_manifest
 from hood.app.batch.rows import DataRow, row_seed, rows_of
 from hood.app.batch.work import Call, HopelessError, pull, settings_of
 from hood.app.settings.compose import ConfigError, load_config
@@ -355,6 +357,35 @@ def test_a_missing_package_is_named_with_its_command(
     monkeypatch.setattr(engines.importlib.util, "find_spec", lambda name: None)
     assert main(["dress", "motions=[plie]", f"engine={engine}", "workers=1", "output=unused"]) == 2
     assert f'engine={engine} needs the package {package}: pip install "hood-cloth[{engine}]"' in capsys.readouterr().err
+
+
+def test_a_manifest_as_columns() -> None:
+    lines = [
+        {"row": "a", "verdict": "sound", "settings": {"garment": "tank"}, "frames": 3, "doubts": [{"kind": "speed"}]},
+        {"row": "b", "verdict": "failed", "settings": {"garment": "skirt", "size": "1.1"}, "error": "torn"},
+    ]
+    assert parquet_columns(lines) == {
+        **{"row": ["a", "b"], "verdict": ["sound", "failed"], "frames": [3, None], "doubts": ['[{"kind": "speed"}]', None]},
+        **{"settings.garment": ["tank", "skirt"], "error": [None, "torn"], "settings.size": [None, "1.1"]},
+    }
+
+
+def test_a_manifest_as_parquet_or_how_to_install_it(
+    motions: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_this_process(monkeypatch)
+    command = ["dress", *CHEAP, "motions=motions", "output=out", "fail_on=nothing", "fail_fraction=1", "parquet=true"]
+    if importlib.util.find_spec("pyarrow") is None:
+        assert main(command) == 2
+        assert 'parquet=true needs the package pyarrow: pip install "hood-cloth[parquet]"' in capsys.readouterr().err
+        assert not Path("out").exists()
+        return
+    assert main(command[:-1]) == 0
+    assert not Path("out/manifest.parquet").exists()
+    assert main(command) == 0  # all rows were done before
+    table = importlib.import_module("pyarrow.parquet").read_table("out/manifest.parquet").to_pydict()
+    assert table == parquet_columns(read_manifest(Path("out")).values())
+    assert sorted(table["verdict"]) == ["doubtful", "doubtful", "failed"]
 
 
 def test_a_dry_run_counts_and_writes_nothing(motions: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 import hood
 from hood.cli.main import main
+from hood.rollouts.file import dataset
 from hood.rollouts.file.compact import BOTH, POSITION_STEP, make_compact
 from hood.rollouts.file.dataset import RolloutDataset
 from hood.rollouts.file.recorder import RolloutWriter
@@ -170,3 +171,16 @@ def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
     (folder / "dress" / "walk0" / "rollout.h5").write_text("nothing")
     with pytest.raises(ValueError, match=r"walk0/rollout\.h5: not a rollout file"):
         data[0]
+
+
+def test_bodies_of_windows_that_cross_chunks_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    main(["rollout", *CHEAP, "num_frames=36", "formats=[cloth]", "output=out"])
+    monkeypatch.setattr(dataset, "_KEPT", 0)  # nothing stays
+    data = RolloutDataset(["out"], window=5, body="pos")
+    whole = hood.read_rollout("out/rollout.h5").body_pos
+    for index in (0, 29, 31):
+        np.testing.assert_allclose(data[index]["body_pos"], whole[index : index + 5], rtol=0, atol=1e-6)
+    assert data[31]["body_pos"].dtype == torch.float32
+    assert not data._unpacked
+    assert data._kept == 0
