@@ -44,11 +44,11 @@ from hood.steppers.checkpoint import read_header
 from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES
 from hood.training import distributed
+from hood.training.callbacks import ValidationWatch
 from hood.training.checkpoint import previous
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import ValidationWatch
 
 #: Keys that a resumed run may change: they do not change what is learned.
 _FREE = ("resume", "output", "device", "validation_states")

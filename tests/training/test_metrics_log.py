@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hood.training.log import LogWindow, MetricsLog
+from hood.training.log import LogWindow, MetricsLog, TensorBoard
 
 
 def read(folder: Path) -> list[dict]:
@@ -68,7 +68,9 @@ def test_tensorboard_alone_does_not_end_a_run(tmp_path: Path, capsys: pytest.Cap
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with MetricsLog(tmp_path, 0) as log:
-        log._board = Full()
+        board = TensorBoard()
+        board._board = Full()  # type: ignore[attr-defined]
+        log._loggers = [board]
         log.write(1, {"total": 1.0, "loss": 2.0})
         log.write(2, {"total": 1.0})
     assert [record["iteration"] for record in read(tmp_path)] == [1, 2]

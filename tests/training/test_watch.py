@@ -18,11 +18,11 @@ from hood.evaluation.validation import Validation
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import NetworkStepper, build_simulator
+from hood.training.callbacks import ValidationWatch
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import ValidationWatch
 
 SETTINGS = TrainerSettings(
     iterations=6, batch_size=1, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=100, maximum=2, start=2),
