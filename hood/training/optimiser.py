@@ -51,11 +51,7 @@ def check_optimizer(choice: str | partial[Any]) -> None:
 
 
 def check_schedule(choice: Schedule | partial[Any], validates: bool) -> None:
-    """Raise ValueError where ``trainer.schedule`` says no rates.
-
-    Args:
-        validates: the training has validations.
-    """
+    """Raise ValueError where ``trainer.schedule`` says no rates to a training, which ``validates`` or not."""
     if not isinstance(choice, partial):
         if not callable(choice):
             raise ValueError(f"trainer.schedule: {named(type(choice))} has no method __call__(iteration, num_iterations)")
@@ -108,6 +104,8 @@ def made(key: str, part: partial[Any], *given: Any, **more: Any) -> Any:
     try:
         return part(*given, **more)
     except (TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, ValueError) and part.func.__module__.startswith("hood."):
+            raise  # its sentences name the key
         raise ValueError(f"{key}: {named(part.func)}: {' '.join(str(error).split())}") from error
 
 
@@ -118,10 +116,9 @@ def named(kind: Any) -> str:
 
 def _class_of(key: str, choice: partial[Any], base: type) -> Any:
     """The class of a part, which must be one of ``base``."""
-    kind = choice.func if isinstance(choice, partial) else choice
-    if not (inspect.isclass(kind) and issubclass(kind, base)):
-        raise ValueError(f"{key}: {named(kind)} is no class of {base.__module__}.{base.__qualname__}")
-    return kind
+    if not (inspect.isclass(choice.func) and issubclass(choice.func, base)):
+        raise ValueError(f"{key}: {named(choice.func)} is no class of {base.__module__}.{base.__qualname__}")
+    return choice.func
 
 
 class Rates:

@@ -30,6 +30,7 @@ from hood.training.checkpoint import (
     load_last_good,
     previous,
     refuse_other,
+    require_plain,
     save_checkpoint,
     set_aside,
     set_generator_states,
@@ -309,6 +310,8 @@ class Trainer:
             "callbacks": self.reporter.callback_states(),
             "model": self.simulator.config,
         }
+        require_plain("trainer.schedule", state["rates"])
+        require_plain("callbacks", state["callbacks"])
         distributed.on_main(lambda: self._write(state))
         self._saved_at = self.iteration
         self.reporter.call("after_checkpoint", self.iteration)
