@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -67,6 +68,8 @@ _BOOKKEEPING = (
     "max_rollbacks",
 )
 
+
+logging.getLogger("hydra.utils").disabled = True  # the error that follows says the same, in one sentence
 
 #: Is told the iteration, and what was measured in it, None where it was validated.
 Tick = Callable[[int, dict[str, float] | None], None]
@@ -266,7 +269,10 @@ def _unmade(key: str, node: Any) -> partial[Any]:
     if key == "trainer.schedule":
         several = {name: [_unmade(key, one) if isinstance(one, dict) else one for one in value]
                    for name, value in table.items() if isinstance(value, list)}  # fmt: skip
-    part: partial[Any] = build({**table, **dict.fromkeys(several), "_partial_": True})
+    try:
+        part: partial[Any] = build({**table, **dict.fromkeys(several), "_partial_": True})
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {str(error).removeprefix('configuration: ')}") from error
     return partial(part.func, **{**part.keywords, **several})
 
 

@@ -92,9 +92,10 @@ class EarlyStopping(Callback):
         least_change: float = 0.0,
         larger_is_better: bool = False,
     ) -> None:
-        if patience < 1 or least_change < 0:
+        if not (isinstance(patience, int) and patience >= 1 and isinstance(least_change, (int, float)) and least_change >= 0):
             raise ValueError(
-                f"callbacks: EarlyStopping has patience={patience} and least_change={least_change:g}; give at least 1 and 0"
+                f"callbacks: EarlyStopping has patience={patience!r} and least_change={least_change!r}; give a whole "
+                "number of at least 1, and a number of at least 0"
             )
         self.measure, self.patience, self.least_change = measure, patience, least_change
         self._sign = -1.0 if larger_is_better else 1.0

@@ -148,6 +148,12 @@ class SceneSampler:
             ValueError: every motion is shorter than that, or a motion that was drawn cannot be read.
         """
         drawn = self.draw(rng, num_steps, garment)
+        given, needed = drawn.sequence.num_frames, drawn.start_frame + num_steps + 2
+        if given < needed:
+            raise ValueError(
+                f"data: {type(self).__qualname__}.draw gave {given} frames with start_frame={drawn.start_frame} for "
+                f"{num_steps} steps; give at least start_frame + num_steps + 2 = {needed}"
+            )
         body, worn = self._assets(drawn.template, drawn.mirrored)
         motion = body_motion(body, drawn.sequence, drawn.betas)
         scene = dress(worn, motion, drawn.material, drawn.size)
