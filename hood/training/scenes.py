@@ -155,7 +155,7 @@ class SceneSampler:
                 f"{num_steps} steps; give at least start_frame + num_steps + 2 = {needed}"
             )
         body, worn = self._assets(drawn.template, drawn.mirrored)
-        motion = body_motion(body, drawn.sequence, drawn.betas)
+        motion = body_motion(body, drawn.sequence, np.asarray(drawn.betas, dtype=np.float64))
         scene = dress(worn, motion, drawn.material, drawn.size)
         return Window(scene, drawn.start_frame, drawn.template, drawn.mirrored, drawn.still)
 

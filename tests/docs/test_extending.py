@@ -39,7 +39,10 @@ SHORT = {
     "evaluate": ["garments=[tank]", "num_frames=4", "gap_states=0"],
     "prepare": [],
 }  # fmt: skip
-RECIPES = ("An energy", "A fabric", "A group of features", "An output and a network", "A stepper", "A file format")
+RECIPES = (
+    *("An energy", "A fabric", "A group of features", "An output and a network", "A stepper", "A file format"),
+    *("An optimiser and a schedule", "A logger", "A callback", "A data set"),
+)
 
 
 def sections() -> dict[str, str]:

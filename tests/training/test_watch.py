@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from hood.energies.potential import default_potential
 from hood.evaluation.gap import REFERENCE
@@ -78,6 +80,15 @@ def test_a_resumed_run_knows_what_was_best(tmp_path: Path, sampler: SceneSampler
     assert second.run()
     assert second.best == 1.0
     assert (tmp_path / "best.safetensors").read_bytes() == before
+
+
+def test_a_rate_that_falls_on_a_plateau_reads_the_score(tmp_path: Path, sampler: SceneSampler) -> None:
+    settings = replace(SETTINGS, schedule=partial(ReduceLROnPlateau, patience=0, factor=0.5), iterations=8)
+    trainer = Trainer(tiny(), default_potential(), sampler, settings, tmp_path, 0, Scripted({2: 3.0, 4: 3.0, 6: 1.0, 8: 1.0}))  # type: ignore[arg-type]
+    assert trainer.run()
+    rates = [line["learning_rate"] for line in lines(tmp_path) if "learning_rate" in line]
+    assert rates == [1e-3] * 4 + [5e-4] * 4
+    assert trainer.optimizer.param_groups[0]["lr"] == 2.5e-4
 
 
 def test_models_that_break_are_never_best(tmp_path: Path, sampler: SceneSampler) -> None:
