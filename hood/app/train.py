@@ -49,7 +49,7 @@ from hood.training import distributed
 from hood.training.callbacks import Callback, ValidationWatch
 from hood.training.checkpoint import previous
 from hood.training.log import LOGGERS, Logger
-from hood.training.optimiser import made, named
+from hood.training.optimiser import dotted_name, made
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
@@ -256,7 +256,7 @@ def _part(key: str, node: Any, base: type, **arguments: Any) -> Any:
     """The object of a class of ``base`` that a table under a key names by ``_target_``, with the table's other keys."""
     part = _unmade(key, node)
     if not (isinstance(part.func, type) and issubclass(part.func, base)):
-        raise ConfigError(f"{key}: {named(part.func)} is no class of {named(base)}")
+        raise ConfigError(f"{key}: {dotted_name(part.func)} is no class of {dotted_name(base)}")
     return made(key, part, **arguments)
 
 

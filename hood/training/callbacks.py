@@ -21,7 +21,7 @@ from hood.rollouts.frames import KeptFrames
 from hood.steppers.network import NetworkStepper
 from hood.training import distributed
 from hood.training.log import Logger, LogWindow, MetricsLog
-from hood.training.optimiser import named
+from hood.training.optimiser import dotted_name
 from hood.training.outcome import MEASURED, ConstantOutput
 
 if TYPE_CHECKING:
@@ -206,13 +206,15 @@ class Reporter:
 
     def callback_states(self) -> list[dict[str, Any]]:
         """What callbacks keep, for a checkpoint."""
-        return [{"callback": named(type(one)), "state": one.state_dict()} for one in self._callbacks]
+        return [{"callback": dotted_name(type(one)), "state": one.state_dict()} for one in self._callbacks]
 
     def give_states(self, states: Sequence[Mapping[str, Any]]) -> None:
         """The inverse: each has the first state of its class that none before it has; one that is new begins without."""
         left = list(states)
         for callback in self._callbacks:
-            found = next((number for number, entry in enumerate(left) if entry["callback"] == named(type(callback))), None)
+            found = next(
+                (number for number, entry in enumerate(left) if entry["callback"] == dotted_name(type(callback))), None
+            )
             if found is not None:
                 callback.load_state_dict(left.pop(found)["state"])
 

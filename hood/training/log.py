@@ -25,7 +25,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import install, say
 
 #: What ``metrics.jsonl`` holds of a line: the iteration and the figures; None where one was not finite.
-Record = Mapping[str, float | None]
+LogRecord = Mapping[str, float | None]
 
 
 class Clock:
@@ -59,7 +59,7 @@ class Logger:
 
     config: Mapping[str, Any] = {}
 
-    def begin(self, folder: Path, iteration: int, records: Sequence[Record]) -> None:
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
         """Training begins or goes on at an iteration, with these records so far; later ones that were written are void.
 
         Called again, after :meth:`end`, when training goes back to a checkpoint.
@@ -78,7 +78,7 @@ class Logger:
 class TensorBoard(Logger):
     """Events in the folder ``tensorboard`` of the run."""
 
-    def begin(self, folder: Path, iteration: int, records: Sequence[Record]) -> None:
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
@@ -103,7 +103,7 @@ class TensorBoard(Logger):
 class Csv(Logger):
     """``metrics.csv``: a row a record, a column a figure; empty where a record has none, or none that is finite."""
 
-    def begin(self, folder: Path, iteration: int, records: Sequence[Record]) -> None:
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
         self._path, self._rows = folder / "metrics.csv", [dict(record) for record in records]
         self._columns = list(dict.fromkeys(["iteration", *(name for row in self._rows for name in row)]))
         self._write_all()
@@ -143,7 +143,7 @@ class Wandb(Logger):
             raise ValueError(f"loggers: wandb is not installed ({install('wandb')})")
         self._project, self._name = project, name
 
-    def begin(self, folder: Path, iteration: int, records: Sequence[Record]) -> None:
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
         import wandb
 
         for old in (folder / "wandb").glob("offline-run-*"):
@@ -190,7 +190,7 @@ class MetricsLog:
 
     def __init__(self, folder: Path, iteration: int, loggers: Sequence[Logger] | None = None) -> None:
         self._folder, self.path = folder, folder / "metrics.jsonl"
-        self._loggers = [TensorBoard()] if loggers is None else list(loggers)
+        self._loggers: list[Logger] = [TensorBoard()] if loggers is None else list(loggers)
         self._open(iteration)
 
     def write(self, iteration: int, values: dict[str, float]) -> None:

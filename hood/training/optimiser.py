@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from hood.assets.files.library import unknown
 from hood.model.features.normalizer import Whitening
@@ -30,34 +30,6 @@ OPTIMIZERS = ("adam", "muon")
 _TAKEN_BACK = (torch.optim.Adam, torch.optim.AdamW)
 #: From the iteration and the number of all iterations, the factor on the learning rate.
 Schedule = Callable[[int, int], float]
-
-
-def check_optimizer(choice: str | partial[Any]) -> None:
-    """Raise ValueError where ``trainer.optimizer`` is neither a word nor the class of an optimiser that a training can use."""
-    if isinstance(choice, str):
-        if choice not in OPTIMIZERS:
-            raise ValueError(
-                f"trainer.optimizer {choice!r}: give {' or '.join(map(repr, OPTIMIZERS))}, or a class, such as "
-                "{_target_: torch.optim.AdamW}"
-            )
-        return
-    kind = _class_of("trainer.optimizer", choice, torch.optim.Optimizer)
-    if "lr" in choice.keywords:
-        raise ValueError("trainer.optimizer.lr: the rate is trainer.learning_rate, times trainer.schedule; leave lr out")
-    closure = inspect.signature(kind.step).parameters.get("closure")
-    if kind is torch.optim.SparseAdam or (closure is not None and closure.default is inspect.Parameter.empty):
-        needed = "sparse gradients" if kind is torch.optim.SparseAdam else "to compute the loss several times in a step"
-        raise ValueError(f"trainer.optimizer: {named(kind)} needs {needed}; give another one, such as torch.optim.AdamW")
-
-
-def check_schedule(choice: Schedule | partial[Any], validates: bool) -> None:
-    """Raise ValueError where ``trainer.schedule`` says no rates to a training, which ``validates`` or not."""
-    if not isinstance(choice, partial):
-        if not callable(choice):
-            raise ValueError(f"trainer.schedule: {named(type(choice))} has no method __call__(iteration, num_iterations)")
-        return
-    if issubclass(_class_of("trainer.schedule", choice, LRScheduler), ReduceLROnPlateau) and not validates:
-        raise ValueError("trainer.schedule: ReduceLROnPlateau reads the score of validations; give trainer.validate_every")
 
 
 def can_be_taken_back(choice: str | partial[Any]) -> bool:
@@ -100,25 +72,18 @@ def made(key: str, part: partial[Any], *given: Any, **more: Any) -> Any:
     if not any(one.kind is inspect.Parameter.VAR_KEYWORD for one in parameters.values()):
         strange = next((name for name in part.keywords if name not in parameters), None)
         if strange is not None:
-            raise ValueError(f"{key}: {unknown(f'argument of {named(part.func)}', strange, sorted(parameters))}")
+            raise ValueError(f"{key}: {unknown(f'argument of {dotted_name(part.func)}', strange, sorted(parameters))}")
     try:
         return part(*given, **more)
     except (TypeError, ValueError, AttributeError) as error:
         if isinstance(error, ValueError) and part.func.__module__.startswith("hood."):
             raise  # its sentences name the key
-        raise ValueError(f"{key}: {named(part.func)}: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{key}: {dotted_name(part.func)}: {' '.join(str(error).split())}") from error
 
 
-def named(kind: Any) -> str:
+def dotted_name(kind: Any) -> str:
     """A class as ``_target_`` names it."""
     return f"{kind.__module__}.{kind.__qualname__}" if inspect.isclass(kind) else repr(kind)
-
-
-def _class_of(key: str, choice: partial[Any], base: type) -> Any:
-    """The class of a part, which must be one of ``base``."""
-    if not (inspect.isclass(choice.func) and issubclass(choice.func, base)):
-        raise ValueError(f"{key}: {named(choice.func)} is no class of {base.__module__}.{base.__qualname__}")
-    return choice.func
 
 
 class Rates:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
+
+import torch
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from hood.model.features.normalizer import Whitening
 from hood.model.kernels.block import KERNELS
@@ -14,7 +18,7 @@ from hood.model.network.mlp import MLP
 from hood.model.network.model import PRECISIONS
 from hood.steppers.network import NetworkStepper
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, scaled_count
-from hood.training.optimiser import Schedule, check_optimizer, check_schedule, named
+from hood.training.optimiser import OPTIMIZERS, Schedule, dotted_name
 from hood.training.slots import RELAXED_VELOCITIES, TORN_STRAIN
 
 #: What an update is led by, see :class:`TrainerSettings`.
@@ -109,8 +113,8 @@ class TrainerSettings:
             raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
         if self.step not in _STEPS:
             raise ValueError(f"trainer.step {self.step!r}: give {' or '.join(map(repr, _STEPS))}")
-        check_optimizer(self.optimizer)
-        check_schedule(self.schedule, self.validate_every > 0)
+        _check_optimizer(self.optimizer)
+        _check_schedule(self.schedule, self.validate_every > 0)
         if self.signal not in SIGNALS:
             raise ValueError(f"trainer.signal {self.signal!r}: give {' or '.join(map(repr, SIGNALS))}")
         if self.whitening and self.statistics_iterations == 0:
@@ -146,6 +150,14 @@ class TrainerSettings:
         """
         return self.horizon.rollout(iteration) if self.by_rollout else iteration
 
+    def require_updates(self, uses_statistics: bool) -> None:
+        """Raise ValueError where all iterations would only collect the statistics of a model that has some."""
+        if uses_statistics and self.iterations <= self.statistics_iterations:
+            raise ValueError(
+                f"trainer.iterations={self.iterations}: the first {self.statistics_iterations} only collect "
+                "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
+            )
+
     def is_due(self, iteration: int) -> bool:
         """Whether something follows an iteration for which it must be known what came of the updates so far."""
         every = (self.log_every, self.checkpoint_every, self.validate_every)
@@ -168,7 +180,7 @@ class TrainerSettings:
             )
         scale = getattr(self.schedule, "scaled", None)
         if scale is None:
-            name = named(self.schedule.func if isinstance(self.schedule, partial) else type(self.schedule))
+            name = dotted_name(self.schedule.func if isinstance(self.schedule, partial) else type(self.schedule))
             raise ValueError(
                 f"trainer.time_scale={self.time_scale:g}: trainer.schedule is of {name}, which has no method scaled(factor); "
                 "give trainer.time_scale=1"
@@ -181,3 +193,38 @@ class TrainerSettings:
             horizon=self.horizon.scaled(self.time_scale),
             collision=self.collision.scaled(self.time_scale),
         )
+
+
+def _check_optimizer(choice: str | partial[Any]) -> None:
+    """Raise ValueError where ``trainer.optimizer`` is neither a word nor the class of an optimiser that a training can use."""
+    if isinstance(choice, str):
+        if choice not in OPTIMIZERS:
+            raise ValueError(
+                f"trainer.optimizer {choice!r}: give {' or '.join(map(repr, OPTIMIZERS))}, or a class, such as "
+                "{_target_: torch.optim.AdamW}"
+            )
+        return
+    kind = _class_of("trainer.optimizer", choice, torch.optim.Optimizer)
+    if "lr" in choice.keywords:
+        raise ValueError("trainer.optimizer.lr: the rate is trainer.learning_rate, times trainer.schedule; leave lr out")
+    closure = inspect.signature(kind.step).parameters.get("closure")
+    if kind is torch.optim.SparseAdam or (closure is not None and closure.default is inspect.Parameter.empty):
+        needed = "sparse gradients" if kind is torch.optim.SparseAdam else "to compute the loss several times in a step"
+        raise ValueError(f"trainer.optimizer: {dotted_name(kind)} needs {needed}; give another one, such as torch.optim.AdamW")
+
+
+def _check_schedule(choice: Schedule | partial[Any], validates: bool) -> None:
+    """Raise ValueError where ``trainer.schedule`` says no rates to a training, which ``validates`` or not."""
+    if not isinstance(choice, partial):
+        if not callable(choice):
+            raise ValueError(f"trainer.schedule: {dotted_name(type(choice))} has no method __call__(iteration, num_iterations)")
+        return
+    if issubclass(_class_of("trainer.schedule", choice, LRScheduler), ReduceLROnPlateau) and not validates:
+        raise ValueError("trainer.schedule: ReduceLROnPlateau reads the score of validations; give trainer.validate_every")
+
+
+def _class_of(key: str, choice: partial[Any], base: type) -> Any:
+    """The class of a part, which must be one of ``base``."""
+    if not (inspect.isclass(choice.func) and issubclass(choice.func, base)):
+        raise ValueError(f"{key}: {dotted_name(choice.func)} is no class of {base.__module__}.{base.__qualname__}")
+    return choice.func

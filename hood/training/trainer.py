@@ -71,11 +71,7 @@ class Trainer:
         callbacks: Sequence[Callback] = (),
     ) -> None:
         settings = settings.compressed()
-        if settings.iterations <= settings.statistics_iterations and simulator.uses_statistics:
-            raise ValueError(
-                f"trainer.iterations={settings.iterations}: the first {settings.statistics_iterations} only collect "
-                "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
-            )
+        settings.require_updates(simulator.uses_statistics)
         settings.collision.require_its_weight(potential)
         shown = for_networks(potential)
         simulator.use_potential(shown)
