@@ -50,7 +50,7 @@ class Desk:
             (r"garments_dict\.pkl", self.published_garments),
             (r"vto/\w+\.csv", self.split),
             (r"(my_)?shirt\.obj|cape \(1\)\.obj|Röckchen\.obj", self.shirt),
-            (r"shirt\.npz", self.bound_shirt),
+            (r"(my_)?shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
             (r"(first|second)\.txt", self.list_of_motions),

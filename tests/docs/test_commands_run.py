@@ -51,7 +51,7 @@ SHORT = (
         "one update after one that counts features",
     ),
     Short(r"^train.*split\.json", ("trainer.horizon.maximum=2", *VALIDATED), "the motions of these files have ten frames"),
-    Short("^train.*EarlyStopping", VALIDATED, "one validation"),
+    Short("^train.*EarlyStopping", ("data.garments=[tank]", *VALIDATED), "one validation, of one garment"),
     Short("^train.*time_scale=0.02", ("trainer.iterations=50",), "a fiftieth of which is one update"),
     Short("^evaluate.*garments_dict", ("num_frames=4", "gap_states=1", "gap_iterations=2"), "the least number of frames"),
     Short(
