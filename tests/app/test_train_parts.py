@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from torch.optim.lr_scheduler import CosineAnnealingLR, SequentialLR
 
 from hood.app.settings.compose import load_config
+from hood.app.settings.python_words import overrides
 from hood.app.train import make_trainer
 from hood.cli.main import main
 from hood.training.callbacks import EarlyStopping
@@ -56,6 +57,16 @@ def test_a_table_with_a_class_replaces_the_schedule_and_one_without_changes_it()
         "step_size": 2,
         "gamma": 0.5,
     }
+
+
+def test_from_python_they_are_dictionaries() -> None:
+    early = {"_target_": "hood.training.callbacks.EarlyStopping", "measure": "loss", "patience": 3}
+    adamw = {"_target_": "torch.optim.AdamW", "weight_decay": 0.1}
+    words = overrides({"trainer": {"optimizer": adamw, "schedule": {"warmup": 7}}, "callbacks": [early], "loggers": ["csv"]})
+    made = trainer(*words)
+    assert made.optimizer.defaults["weight_decay"] == 0.1
+    assert made.settings.schedule == WarmupCosine(7, 0.01)
+    assert [callback.patience for callback in made.reporter._callbacks] == [3]  # type: ignore[attr-defined]
 
 
 def test_loggers_and_callbacks_of_a_run() -> None:
