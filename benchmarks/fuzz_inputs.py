@@ -27,7 +27,7 @@ from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import load_mesh_sequence
 from hood.assets.motion.recording import read_recording
 from hood.assets.motion.sequence_edit import read_pose
-from hood.assets.pickles.torch_file import load_torch
+from hood.assets.pickles.content import load_torch
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.file.recorder import ALARM_COLUMNS
 from hood.steppers.checkpoint import load_simulator, save_simulator

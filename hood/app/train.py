@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -12,6 +13,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch.optim.lr_scheduler import LRScheduler
 
 from hood.app.common import (
     held_folder,
@@ -44,14 +46,16 @@ from hood.steppers.checkpoint import read_header
 from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES
 from hood.training import distributed
+from hood.training.callbacks import Callback, ValidationWatch
 from hood.training.checkpoint import previous
+from hood.training.log import LOGGERS, Logger
+from hood.training.optimiser import dotted_name, made
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import ValidationWatch
 
 #: Keys that a resumed run may change: they do not change what is learned.
-_FREE = ("resume", "output", "device", "validation_states")
+_FREE = ("resume", "output", "device", "validation_states", "loggers", "callbacks")
 _BOOKKEEPING = (
     "kernels",
     "workers",
@@ -64,6 +68,8 @@ _BOOKKEEPING = (
     "max_rollbacks",
 )
 
+
+logging.getLogger("hydra.utils").disabled = True  # the error that follows says the same, in one sentence
 
 #: Is told the iteration, and what was measured in it, None where it was validated.
 Tick = Callable[[int, dict[str, float] | None], None]
@@ -122,6 +128,9 @@ def _train(overrides: Sequence[str], bar: TrainingBar, notes: list[str]) -> Trai
 
 def _check_values(config: DictConfig) -> None:
     """Raise ConfigError where a key has a value that no training can have, before a file is read."""
+    missing = next((key for key in load_config("train").data if key not in config.data), None)
+    if missing is not None:  # in an option of a plugin
+        raise ConfigError(f"data.{missing} is missing; let the option begin with defaults: [default, _self_]")
     for key, least in (("seed", 0), ("validation_states", 0), ("data.validation_frames", 2)):
         if int(OmegaConf.select(config, key)) < least:
             raise ConfigError(f"{key}={OmegaConf.select(config, key)}: must be at least {least}")
@@ -168,6 +177,8 @@ def _run(config: DictConfig, trainer: Trainer, folder: Path, bar: TrainingBar) -
             say(f"hood: {trainer.skipped} of {tried} updates were skipped, the last one{why}", error=True)
     if main:
         say(f"weights in {folder / 'model.safetensors'}, checkpoint in {trainer.checkpoint_path}")
+    if main and trainer.stopped:
+        say(f"stopped at iteration {trainer.iteration}: {trainer.stopped}; with callbacks=[] resume=true it goes on")
     if main and not finished:
         say(f"hood: stopped at iteration {trainer.iteration}; the same command with resume=true goes on", error=True)
     return trainer.iteration, not finished
@@ -178,7 +189,8 @@ def make_trainer(config: DictConfig) -> Trainer:
     _check_values(config)
     torch.manual_seed(int(config.seed))
     simulator: NetworkStepper = build(config.model)
-    settings: TrainerSettings = build(config.trainer)
+    settings = _make_settings(config)
+    loggers, callbacks = _make_loggers(config), [_part("callbacks", node, Callback) for node in config.callbacks]
     potential: Potential = build(config.losses)
     settings.collision.require_its_weight(potential)
     fps = float(config.data.fps)
@@ -191,7 +203,8 @@ def make_trainer(config: DictConfig) -> Trainer:
     warn_if_slow("trainer.precision", settings.precision, torch.device(str(config.device)))
     leave_out = str(config.data.unusable) == "skip"
     names = find_motions(list(config.data.sequences) or motion_split()["train"], check=not leave_out)
-    sampler = SceneSampler(
+    sampler = _make_scenes(
+        config,
         body=load_body(str(config.data.body)),
         garments=[as_simulated(load_garment(str(name))) for name in config.data.garments],
         sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
@@ -200,7 +213,67 @@ def make_trainer(config: DictConfig) -> Trainer:
     )
     folder = output_folder(config)
     watch = _make_watch(config, sampler, settings.collision.at_end(potential), folder) if settings.validate_every else None
-    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier)
+    return Trainer(simulator, potential, sampler, settings, folder, int(config.seed), watch, earlier, loggers, callbacks)
+
+
+def _make_settings(config: DictConfig) -> TrainerSettings:
+    """Of the trainer; optimisers and schedulers of torch are made later, since they take the weights."""
+    node = plain(config.trainer)
+    parts = {key: node.pop(key) for key in ("optimizer", "schedule")}
+    if isinstance(parts["optimizer"], dict):
+        parts["optimizer"] = _unmade("trainer.optimizer", parts["optimizer"])
+    schedule = _unmade("trainer.schedule", parts["schedule"])
+    scheduler = isinstance(schedule.func, type) and issubclass(schedule.func, LRScheduler)
+    parts["schedule"] = schedule if scheduler else made("trainer.schedule", schedule)
+    return replace(build({**node, "time_scale": 1.0}), **parts, time_scale=float(node["time_scale"]))
+
+
+def _make_loggers(config: DictConfig) -> list[Logger]:
+    """What is told the figures, beside metrics.jsonl."""
+    loggers: list[Logger] = []
+    for given in config.loggers:
+        if given == "jsonl":
+            raise ConfigError("loggers: metrics.jsonl is always written; leave jsonl out, loggers=[] for it alone")
+        if isinstance(given, str) and given not in LOGGERS:
+            raise ConfigError(f"loggers: {unknown('logger', given, LOGGERS)}, or a class {{_target_: …}}")
+        loggers.append(LOGGERS[given]() if isinstance(given, str) else _part("loggers", given, Logger))
+        loggers[-1].config = plain(config)
+    return loggers
+
+
+def _make_scenes(config: DictConfig, **arguments: Any) -> SceneSampler:
+    """What draws the scenes: hood's own class, or the one that ``data`` names, with its keys."""
+    usual = load_config("train").data
+    own = {key: value for key, value in plain(config.data).items() if key not in usual}
+    if not own:
+        return SceneSampler(**arguments)
+    if "_target_" not in own:
+        raise ConfigError(f"data.{next(iter(own))}: {unknown('key', next(iter(own)), list(usual))}")
+    return _part("data", own, SceneSampler, **arguments)  # type: ignore[no-any-return]
+
+
+def _part(key: str, node: Any, base: type, **arguments: Any) -> Any:
+    """The object of a class of ``base`` that a table under a key names by ``_target_``, with the table's other keys."""
+    part = _unmade(key, node)
+    if not (isinstance(part.func, type) and issubclass(part.func, base)):
+        raise ConfigError(f"{key}: {dotted_name(part.func)} is no class of {dotted_name(base)}")
+    return made(key, part, **arguments)
+
+
+def _unmade(key: str, node: Any) -> partial[Any]:
+    """The class and the arguments of such a table."""
+    table = plain(node)
+    if not isinstance(table, dict) or "_target_" not in table:
+        raise ConfigError(f"{key}={shown(table)}: give a class in braces, such as {{_target_: my_package.module.Class}}")
+    several = {}  # schedulers in a scheduler take the optimiser, too
+    if key == "trainer.schedule":
+        several = {name: [_unmade(key, one) if isinstance(one, dict) else one for one in value]
+                   for name, value in table.items() if isinstance(value, list)}  # fmt: skip
+    try:
+        part: partial[Any] = build({**table, **dict.fromkeys(several), "_partial_": True})
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {str(error).removeprefix('configuration: ')}") from error
+    return partial(part.func, **{**part.keywords, **several})
 
 
 def _start_from(simulator: NetworkStepper, name: str, fps: float) -> int:

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hood.assets.pickles.torch_file import load_torch
+from hood.assets.pickles.content import load_torch
 from hood.assets.pickles.unpickle import PICKLE_LIMIT
 from hood.model.graph.builder import BODY, MESH
 from hood.model.graph.schedule import SCHEDULES, Step, edge_set_names, parse_schedule

@@ -40,6 +40,18 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     write_atomically(path, buffer.getvalue(), keep=previous(path))
 
 
+def require_plain(key: str, state: Any) -> None:
+    """Raise ValueError where a checkpoint could not be read back with ``state``, which is of the class under ``key``."""
+    buffer = io.BytesIO()
+    try:
+        torch.save(state, buffer)
+        torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
+    except Exception as error:  # whatever a class of somebody else's raises
+        raise ValueError(
+            f"{key}: state_dict() holds what no checkpoint can; keep in it numbers, texts, lists, tables and tensors alone"
+        ) from error
+
+
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a training checkpoint; only tensors and plain values are accepted, and checksums must hold.
 

@@ -1,62 +1,31 @@
-"""Training metrics: one JSON object per line, and TensorBoard events where TensorBoard is installed.
+"""Where the figures of a training go: one JSON object per line in ``metrics.jsonl``, and loggers beside it: TensorBoard, CSV,
+Weights & Biases, or classes of one's own.
 
-Iterations per second of training alone.
-
-The training loss as one number that can be watched: the potential above what free fall would cost.
-
-Updates that were skipped, since a loss or a gradient was no number: how many, how many in a row, and why.
+Means of the updates since the last record; iterations per second of training alone.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
+import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.said import install, say
-from hood.energies.potential import scale
-from hood.energies.problem import StepProblem
 
-#: An output whose spread is less is one constant.
-CONSTANT = 1e-3
-
-
-def output_spread(acc: Tensor, free: Tensor) -> Tensor:
-    """How much of the accelerations (V, 3) differs between the vertices that are ``free`` (V,): the root of the mean square of
-    what deviates from their mean, over that of all, (). 1 where all are zero."""
-    rows = free.unsqueeze(1).to(acc)
-    mean = (acc * rows).sum(dim=0) / rows.sum().clamp_min(1.0)
-    all_of_it = (acc * rows).norm()
-    return torch.where(all_of_it > 0, ((acc - mean) * rows).norm() / torch.where(all_of_it > 0, all_of_it, 1.0), 1.0)
-
-
-class ConstantOutput:
-    """Says once that a network's output has become a constant: a gradient that reaches one cannot bring the network back."""
-
-    def __init__(self, learning_rate: float) -> None:
-        self._rate, self._told = learning_rate, False
-
-    def look(self, iteration: int, spread: float) -> None:
-        """With the mean of :func:`output_spread` since the last look."""
-        if spread >= CONSTANT or self._told:
-            return
-        self._told = True
-        say(
-            f"hood: iteration {iteration}: the network gives every vertex the same acceleration, whatever it is shown. The "
-            "units of its decoder are dead, and nothing is learned any more; begin again with a lower trainer.learning_rate "
-            f"than {self._rate:g}",
-            error=True,
-        )
+#: What ``metrics.jsonl`` holds of a line: the iteration and the figures; None where one was not finite.
+LogRecord = Mapping[str, float | None]
 
 
 class Clock:
@@ -75,49 +44,168 @@ class Clock:
         self._away += time.monotonic() - left
 
 
-def relative_loss(problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, longest: float | None = None) -> Tensor:
-    """(Φ − Φ_fall) / e0 of every scene (B,): how far the step is above free fall, in units of e0.
+class Logger:
+    """What is told the figures of a training, on process 0. A class of one's own overrides what it needs::
 
-    Φ alone cannot be watched: gravity's zero is arbitrary, so Φ is as often negative as positive. With Φ_fall, inertia plus
-    gravity of the acceleration g, the two become ½ Σ m dt² ‖a − g‖² and no term can be negative; garments of any mass and steps
-    of any length are comparable. Cloth at rest has 1, its weight held up, plus what it is stretched and bent. ``longest``: of
-    :func:`hood.energies.potential.scale`.
+        class Printed(Logger):
+            def write(self, iteration, values):
+                print(iteration, values["loss"])
+
+    One that raises is told nothing more; the training goes on.
+
+    Attributes:
+        config: the keys of the run, as ``config.yaml`` has them; empty where a program trains without them.
     """
-    dt = problem.vertex_dt.squeeze(1)
-    apart = (acc - problem.gravity.to(acc)).square().sum(dim=1)
-    fall = problem.sum_vertices(0.5 * problem.cloth.mass * dt * dt * apart)
-    rest = [value for name, value in energies.items() if name not in ("inertia", "gravity")]
-    return sum(rest, start=fall) / scale(problem, longest)
+
+    config: Mapping[str, Any] = {}
+
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
+        """Training begins or goes on at an iteration, with these records so far; later ones that were written are void.
+
+        Called again, after :meth:`end`, when training goes back to a checkpoint.
+        """
+
+    def write(self, iteration: int, values: Mapping[str, float]) -> None:
+        """The figures of one record; two records may have one iteration, of updates and of a validation."""
+
+    def picture(self, iteration: int, name: str, image: np.ndarray) -> None:
+        """A picture (H, W, 3) uint8."""
+
+    def end(self) -> None:
+        """Nothing more will be written."""
+
+
+class TensorBoard(Logger):
+    """Events in the folder ``tensorboard`` of the run."""
+
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise ImportError(
+                "torch cannot use the one that is installed"
+                if find_spec("tensorboard")
+                else f"it is not installed ({install('tensorboard')})"
+            ) from error
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=iteration + 1 if iteration else None)
+
+    def write(self, iteration: int, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            self._board.add_scalar(name, value, iteration)
+
+    def picture(self, iteration: int, name: str, image: np.ndarray) -> None:
+        self._board.add_image(name, image, iteration, dataformats="HWC")
+
+    def end(self) -> None:
+        self._board.close()
+
+
+class Csv(Logger):
+    """``metrics.csv``: a row a record, a column a figure; empty where a record has none, or none that is finite."""
+
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
+        self._path, self._rows = folder / "metrics.csv", [dict(record) for record in records]
+        self._columns = list(dict.fromkeys(["iteration", *(name for row in self._rows for name in row)]))
+        self._write_all()
+
+    def write(self, iteration: int, values: Mapping[str, float]) -> None:
+        row = _finite({"iteration": iteration, **values})
+        self._rows.append(row)
+        further = [name for name in row if name not in self._columns]
+        self._columns += further
+        if further:
+            self._write_all()
+            return
+        with open(self._path, "a", encoding="utf-8", newline="") as file:
+            file.write(self._text([row]))
+
+    def _write_all(self) -> None:
+        head = dict(zip(self._columns, self._columns, strict=True))
+        write_atomically(self._path, self._text([head, *self._rows]).encode())
+
+    def _text(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        text = io.StringIO()
+        csv.DictWriter(text, self._columns, lineterminator="\n").writerows(rows)
+        return text.getvalue()
+
+
+class Wandb(Logger):
+    """One run of Weights & Biases in the folder ``wandb`` of the run, offline: nothing is sent; ``wandb sync`` does that.
+
+    A training that goes on writes it anew, with all records so far.
+
+    Raises:
+        ValueError: the package is not installed.
+    """
+
+    def __init__(self, project: str = "hood", name: str | None = None) -> None:
+        if find_spec("wandb") is None:
+            raise ValueError(f"loggers: wandb is not installed ({install('wandb')})")
+        self._project, self._name = project, name
+
+    def begin(self, folder: Path, iteration: int, records: Sequence[LogRecord]) -> None:
+        import wandb
+
+        for old in (folder / "wandb").glob("offline-run-*"):
+            shutil.rmtree(old)
+        quiet = wandb.Settings(silent=True, console="off", disable_git=True, save_code=False)
+        name, config = self._name or folder.name, dict(self.config)
+        self._run = wandb.init(
+            project=self._project,
+            name=name,
+            dir=str(folder),
+            config=config,
+            mode="offline",
+            reinit="create_new",
+            settings=quiet,
+        )
+        for record in records:
+            known = {name: value for name, value in record.items() if value is not None and name != "iteration"}
+            self._run.log(known, step=int(record["iteration"] or 0))
+
+    def write(self, iteration: int, values: Mapping[str, float]) -> None:
+        self._run.log(dict(values), step=iteration)
+
+    def picture(self, iteration: int, name: str, image: np.ndarray) -> None:
+        import wandb
+
+        self._run.log({name: wandb.Image(image)}, step=iteration)
+
+    def end(self) -> None:
+        self._run.finish()
+
+
+#: Loggers that have a name.
+LOGGERS: dict[str, type[Logger]] = {"tensorboard": TensorBoard, "csv": Csv, "wandb": Wandb}
 
 
 class MetricsLog:
-    """Appends to ``metrics.jsonl``; on resume, lines after the resumed iteration are dropped first.
+    """Appends to ``metrics.jsonl``; on resume, lines after the resumed iteration are dropped first. Loggers are told the same.
 
-    A disk that refuses a line raises an OSError that names the file; one that refuses TensorBoard's events ends those.
+    A disk that refuses a line raises an OSError that names the file; a logger that fails is dropped, and a line says so.
+
+    Args:
+        loggers: None: TensorBoard.
     """
 
-    def __init__(self, folder: Path, iteration: int) -> None:
-        self._folder = folder
-        self.path = folder / "metrics.jsonl"
+    def __init__(self, folder: Path, iteration: int, loggers: Sequence[Logger] | None = None) -> None:
+        self._folder, self.path = folder, folder / "metrics.jsonl"
+        self._loggers: list[Logger] = [TensorBoard()] if loggers is None else list(loggers)
         self._open(iteration)
-        if self._board is None:
-            say(f"hood: no TensorBoard events: {_missing()}; all numbers are in {self.path}", error=True)
 
     def write(self, iteration: int, values: dict[str, float]) -> None:
         """One record, on disk at once, so that a killed run keeps it; what is not a finite number becomes null."""
-        record = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        line = (json.dumps({"iteration": iteration, **record}) + "\n").encode()
+        line = (json.dumps(_finite({"iteration": iteration, **values})) + "\n").encode()
         try:
             while line:
                 line = line[self._file.write(line) or 0 :]
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
-        for name, value in values.items():
-            self._to_board("add_scalar", name, value, iteration)
+        self._tell("write", iteration, values)
 
     def picture(self, iteration: int, name: str, image: np.ndarray) -> None:
-        """A picture (H, W, 3) uint8 for TensorBoard."""
-        self._to_board("add_image", name, image, iteration, dataformats="HWC")
+        """A picture (H, W, 3) uint8 for loggers that show some."""
+        self._tell("picture", iteration, name, image)
 
     def cut(self, iteration: int) -> None:
         """Drop what was recorded after ``iteration``: training went back there."""
@@ -131,22 +219,25 @@ class MetricsLog:
         self._close()
 
     def _open(self, iteration: int) -> None:
-        write_atomically(self.path, "".join(_lines_up_to(self.path, iteration)).encode())
+        lines = _lines_up_to(self.path, iteration)
+        write_atomically(self.path, "".join(lines).encode())
         self._file = open(self.path, "ab", buffering=0)
-        self._board = _tensorboard(self._folder, iteration)
+        self._tell("begin", self._folder, iteration, [json.loads(line) for line in lines])
 
     def _close(self) -> None:
         self._file.close()
-        self._to_board("close")
+        self._tell("end")
 
-    def _to_board(self, method: str, *values: Any, **options: Any) -> None:
-        if self._board is None:
-            return
-        try:
-            getattr(self._board, method)(*values, **options)
-        except (OSError, ImportError) as error:
-            self._board = None
-            say(f"hood: no more TensorBoard events: {error}", error=True)
+    def _tell(self, method: str, *values: Any) -> None:
+        for logger in tuple(self._loggers):
+            try:
+                getattr(logger, method)(*values)
+            except Exception as error:  # whatever a logger raises: its figures are worth less than the training
+                self._loggers.remove(logger)
+                more, name = "no" if method == "begin" else "no more", type(logger).__name__
+                what = f"{name} events" if isinstance(logger, TensorBoard) else f"figures for the logger {name}"
+                reason = " ".join(str(error).split()) or type(error).__name__
+                say(f"hood: {more} {what}: {reason}; all numbers are in {self.path}", error=True)
 
 
 class LogWindow:
@@ -182,6 +273,10 @@ class LogWindow:
         self._reports = list(state)
 
 
+def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
 def _lines_up_to(path: Path, iteration: int) -> list[str]:
     if not path.exists():
         return []
@@ -193,69 +288,3 @@ def _lines_up_to(path: Path, iteration: int) -> list[str]:
         except (ValueError, KeyError, TypeError):
             continue  # a line cut by a kill
     return kept
-
-
-def _missing() -> str:
-    """Why there are no events, with the way out."""
-    try:
-        import tensorboard  # noqa: F401
-    except ImportError:
-        return f"it is not installed ({install('tensorboard')})"
-    return "torch cannot use the one that is installed"
-
-
-def _tensorboard(folder: Path, iteration: int) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder / "tensorboard"), purge_step=iteration + 1 if iteration else None)
-
-
-class Skipped:
-    """Counts the updates of a training; what it says is about the whole run, what was rolled back included.
-
-    Attributes:
-        count: updates that were skipped.
-        in_row: of these, those since the last one that was made.
-        made: updates that were made, and not rolled back.
-        reason: why the last one was skipped; empty where another process saw it.
-    """
-
-    def __init__(self) -> None:
-        self.count, self.in_row, self.made = 0, 0, 0
-        self.reason = ""
-
-    def skip(self, iteration: int, energies: Mapping[str, float], norm: float) -> None:
-        """An update that is not made, with the means of its energies and the length of its gradient."""
-        self.count, self.in_row = self.count + 1, self.in_row + 1
-        lost = [name for name, value in energies.items() if not math.isfinite(value)]
-        if lost:
-            self.reason = f"iteration {iteration}: energy {lost[0]} is {energies[lost[0]]}"
-        else:
-            self.reason = "" if math.isfinite(norm) else f"iteration {iteration}: the length of the gradient is {norm}"
-
-    def make(self) -> None:
-        """An update that is made."""
-        self.made, self.in_row = self.made + 1, 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """What a resumed run goes on with."""
-        return {"skipped": self.count, "skipped_in_row": self.in_row, "made": self.made, "skip_reason": self.reason}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Back to what :meth:`state_dict` gave; older checkpoints do not say how many were made."""
-        self.count, self.in_row = int(state["skipped"]), int(state["skipped_in_row"])
-        self.made = made_behind(state)
-        self.reason = str(state.get("skip_reason", ""))
-
-
-def made_behind(state: Mapping[str, Any]) -> int:
-    """Updates that were made behind a checkpoint."""
-    return int(state.get("made", state["iteration"]))
-
-
-def told(reasons: list[str]) -> str:
-    """The reason of the first process that has one, in brackets."""
-    reason = next((reason for reason in reasons if reason), "")
-    return f" ({reason})" if reason else ""

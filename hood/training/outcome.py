@@ -1,6 +1,10 @@
 """What comes of updates: figures on the device, which the host reads at once or many updates later.
 
 Between two reads the device alone decides whether gradients are used and which rollouts go on.
+
+The training loss as one number that can be watched: the potential above what free fall would cost.
+
+Updates that were skipped, since a loss or a gradient was no number: how many, how many in a row, and why.
 """
 
 from __future__ import annotations
@@ -13,13 +17,12 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from hood.assets.files.said import say
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import centres_of
 from hood.energies.potential import scale
 from hood.energies.problem import StepProblem
-from hood.model.features.normalizer import Whitening
 from hood.scene.scene import RELAXING_DT
-from hood.training.log import output_spread, relative_loss
 from hood.training.slots import Taken, is_lost
 
 #: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
@@ -39,7 +42,7 @@ class Signal:
         self._longest = _FRAME_DT if name == "scaled_by_frame" else None
 
     def loss(self, problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, residual: Tensor) -> Tensor:
-        """What is minimised, of every scene (B,), in units of e0: :func:`hood.training.log.relative_loss`."""
+        """What is minimised, of every scene (B,), in units of e0: :func:`relative_loss`."""
         return relative_loss(problem, energies, acc, self._longest) * self._damping(residual)
 
     def weight(self, problem: StepProblem, residual: Tensor) -> Tensor:
@@ -167,51 +170,97 @@ def outcome_of(cloth: Cloth, next_pos: Tensor, torn_strain: float) -> Tensor:
     return torch.cat([lost.to(next_pos).unsqueeze(1), centres_of(next_pos, cloth.vertex_scene, len(lost))], dim=1)
 
 
-class WeightSteps:
-    """Steps of an optimiser and what changes with them: averages of the weights, and layers whose updates are whitened.
+def relative_loss(problem: StepProblem, energies: Mapping[str, Tensor], acc: Tensor, longest: float | None = None) -> Tensor:
+    """(Φ − Φ_fall) / e0 of every scene (B,): how far the step is above free fall, in units of e0.
 
-    Args:
-        ema_decay: share that averages keep of themselves in a step, at most; 0: there are none.
+    Φ alone cannot be watched: gravity's zero is arbitrary, so Φ is as often negative as positive. With Φ_fall, inertia plus
+    gravity of the acceleration g, the two become ½ Σ m dt² ‖a − g‖² and no term can be negative; garments of any mass and steps
+    of any length are comparable. Cloth at rest has 1, its weight held up, plus what it is stretched and bent. ``longest``: of
+    :func:`hood.energies.potential.scale`.
+    """
+    dt = problem.vertex_dt.squeeze(1)
+    apart = (acc - problem.gravity.to(acc)).square().sum(dim=1)
+    fall = problem.sum_vertices(0.5 * problem.cloth.mass * dt * dt * apart)
+    rest = [value for name, value in energies.items() if name not in ("inertia", "gravity")]
+    return sum(rest, start=fall) / scale(problem, longest)
+
+
+#: An output whose spread is less is one constant.
+CONSTANT = 1e-3
+
+
+def output_spread(acc: Tensor, free: Tensor) -> Tensor:
+    """How much of the accelerations (V, 3) differs between the vertices that are ``free`` (V,): the root of the mean square of
+    what deviates from their mean, over that of all, (). 1 where all are zero."""
+    rows = free.unsqueeze(1).to(acc)
+    mean = (acc * rows).sum(dim=0) / rows.sum().clamp_min(1.0)
+    all_of_it = (acc * rows).norm()
+    return torch.where(all_of_it > 0, ((acc - mean) * rows).norm() / torch.where(all_of_it > 0, all_of_it, 1.0), 1.0)
+
+
+class ConstantOutput:
+    """Says once that a network's output has become a constant: a gradient that reaches one cannot bring the network back."""
+
+    def __init__(self, learning_rate: float) -> None:
+        self._rate, self._told = learning_rate, False
+
+    def look(self, iteration: int, spread: float) -> None:
+        """With the mean of :func:`output_spread` since the last look."""
+        if spread >= CONSTANT or self._told:
+            return
+        self._told = True
+        say(
+            f"hood: iteration {iteration}: the network gives every vertex the same acceleration, whatever it is shown. The "
+            "units of its decoder are dead, and nothing is learned any more; begin again with a lower trainer.learning_rate "
+            f"than {self._rate:g}",
+            error=True,
+        )
+
+
+class Skipped:
+    """Counts the updates of a training; what it says is about the whole run, what was rolled back included.
 
     Attributes:
-        average: exponentially averaged weights, by name.
+        count: updates that were skipped.
+        in_row: of these, those since the last one that was made.
+        made: updates that were made, and not rolled back.
+        reason: why the last one was skipped; empty where another process saw it.
     """
 
-    def __init__(
-        self, model: torch.nn.Module, optimizer: torch.optim.Optimizer, whitening: Whitening, ema_decay: float
-    ) -> None:
-        self._optimizer, self._whitening, self._decay = optimizer, whitening, ema_decay
-        self._weights: list[Tensor] = list(model.parameters())
-        self.average = {name: value.detach().clone() for name, value in model.named_parameters()}
+    def __init__(self) -> None:
+        self.count, self.in_row, self.made = 0, 0, 0
+        self.reason = ""
 
-    @torch.no_grad()
-    def take(self, iteration: int, wanted: Tensor | None = None) -> None:
-        """One step; where ``wanted`` () bool is false on the device, it is taken back to the last bit. Gradients must then be
-        finite in any case."""
-        before = [] if wanted is None else self._tensors()
-        kept = list(torch._foreach_mul(before, 1.0)) if before else []  # copies, by one kernel
-        self._whitening.push(self._optimizer)
-        if self._decay > 0:
-            # Early averages forget faster, so that the first checkpoints are not the untrained weights.
-            decay = min(self._decay, (1 + iteration) / (10 + iteration))
-            torch._foreach_lerp_(list(self.average.values()), self._weights, 1 - decay)
-        if wanted is None:
-            return
-        known = {id(value) for value in before}
-        # What the optimiser makes for its first step is zero before it.
-        new = [value for value in self._tensors() if id(value) not in known]
-        factor = wanted.to(before[0])
-        torch._foreach_mul_([*before, *new], factor)
-        torch._foreach_mul_(kept, 1.0 - factor)
-        torch._foreach_add_(before, kept)
+    def skip(self, iteration: int, energies: Mapping[str, float], norm: float) -> None:
+        """An update that is not made, with the means of its energies and the length of its gradient."""
+        self.count, self.in_row = self.count + 1, self.in_row + 1
+        lost = [name for name, value in energies.items() if not math.isfinite(value)]
+        if lost:
+            self.reason = f"iteration {iteration}: energy {lost[0]} is {energies[lost[0]]}"
+        else:
+            self.reason = "" if math.isfinite(norm) else f"iteration {iteration}: the length of the gradient is {norm}"
 
-    def forget(self, count: int) -> None:
-        """``count`` steps were taken back: they are not counted where the optimiser counts on the host."""
-        for state in self._optimizer.state.values():
-            if isinstance(state.get("step"), int):
-                state["step"] -= count
+    def make(self) -> None:
+        """An update that is made."""
+        self.made, self.in_row = self.made + 1, 0
 
-    def _tensors(self) -> list[Tensor]:
-        """All that a step changes."""
-        states = [value for p in self._weights for value in self._optimizer.state[p].values() if isinstance(value, Tensor)]
-        return [*self._weights, *states, *(self.average.values() if self._decay > 0 else ())]
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run goes on with."""
+        return {"skipped": self.count, "skipped_in_row": self.in_row, "made": self.made, "skip_reason": self.reason}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Back to what :meth:`state_dict` gave; older checkpoints do not say how many were made."""
+        self.count, self.in_row = int(state["skipped"]), int(state["skipped_in_row"])
+        self.made = made_behind(state)
+        self.reason = str(state.get("skip_reason", ""))
+
+
+def made_behind(state: Mapping[str, Any]) -> int:
+    """Updates that were made behind a checkpoint."""
+    return int(state.get("made", state["iteration"]))
+
+
+def told(reasons: list[str]) -> str:
+    """The reason of the first process that has one, in brackets."""
+    reason = next((reason for reason in reasons if reason), "")
+    return f" ({reason})" if reason else ""

@@ -52,8 +52,27 @@ class Window:
         return replace(self, scene=replace(scene, cloth=to_device(scene.cloth, device), motion=motion))
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What a training scene is made of."""
+
+    template: int  # index into the sampler's garments
+    sequence: (
+        PoseSequence  # with a frame before the start frame, where there is one, and all frames that are asked for behind it
+    )
+    start_frame: int  # in ``sequence``
+    betas: np.ndarray  # shape coefficients of the body
+    size: float  # factor of the garment
+    material: Material
+    mirrored: bool = False  # the scene is shown as its image x → −x
+    still: bool = False  # see :class:`Window`
+
+
 class SceneSampler:
     """Draws training scenes; a scene is a function of the generator alone, so a seed replays it.
+
+    A data set of one's own is a subclass that overrides :meth:`draw`: what comes of it goes through workers, resumes and
+    several processes as here. It takes the arguments of this class beside its own ones, and takes all chance from ``rng``.
 
     Scenes are made on the CPU, whatever device they are moved to.
 
@@ -128,6 +147,20 @@ class SceneSampler:
         Raises:
             ValueError: every motion is shorter than that, or a motion that was drawn cannot be read.
         """
+        drawn = self.draw(rng, num_steps, garment)
+        given, needed = drawn.sequence.num_frames, drawn.start_frame + num_steps + 2
+        if given < needed:
+            raise ValueError(
+                f"data: {type(self).__qualname__}.draw gave {given} frames with start_frame={drawn.start_frame} for "
+                f"{num_steps} steps; give at least start_frame + num_steps + 2 = {needed}"
+            )
+        body, worn = self._assets(drawn.template, drawn.mirrored)
+        motion = body_motion(body, drawn.sequence, np.asarray(drawn.betas, dtype=np.float64))
+        scene = dressed_scene(worn, motion, drawn.material, drawn.size)
+        return Window(scene, drawn.start_frame, drawn.template, drawn.mirrored, drawn.still)
+
+    def draw(self, rng: np.random.Generator, num_steps: int, garment: int | None = None) -> Drawn:
+        """What a scene is made of, with the arguments and errors of :meth:`sample`. A class of one's own overrides this."""
         index = int(rng.integers(len(self.garments))) if garment is None else garment % len(self.garments)
         template = self.garments[index]
         window, start = self._draw_motion(rng, num_steps)
@@ -138,10 +171,8 @@ class SceneSampler:
         size = float(rng.uniform(self.size_low, self.size_high))
         material = self.material or sample_material(rng, template.rest_pos, self.piecewise_fraction, uniform=self.uniform)
         mirrored = self.mirror and rng.random() < 0.5
-        body, worn = self._assets(index, mirrored)
-        scene = dressed_scene(worn, body_motion(body, window, betas), material, size)
         still = self.still_fraction > 0 and rng.random() < self.still_fraction
-        return Window(scene, min(start, 1), index, mirrored, still)
+        return Drawn(index, window, min(start, 1), betas, size, material, mirrored, still)
 
     def pack(self, window: Window) -> dict[str, Any]:
         """A sampled window as plain arrays, without the body and the garment that every process has; surfaces posed."""

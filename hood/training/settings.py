@@ -1,16 +1,15 @@
-"""How a model is trained: the settings of :class:`hood.training.trainer.Trainer` and what refuses them.
-
-Optimisers for networks whose loss is ill-conditioned: orthogonalised momentum for matrices, Adam for the rest.
-"""
+"""How a model is trained: the settings of :class:`hood.training.trainer.Trainer` and what refuses them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from hood.model.features.normalizer import Whitening
 from hood.model.kernels.block import KERNELS
@@ -18,116 +17,12 @@ from hood.model.network.kernel_choice import AUTO
 from hood.model.network.mlp import MLP
 from hood.model.network.model import PRECISIONS
 from hood.steppers.network import NetworkStepper
-from hood.training.curriculum import CollisionRamp, Horizon, InverseRoot, StepDecay, WarmupCosine, scaled_count
+from hood.training.curriculum import CollisionRamp, Horizon, StepDecay, scaled_count
+from hood.training.optimiser import OPTIMIZERS, Schedule, dotted_name
 from hood.training.slots import RELAXED_VELOCITIES, TORN_STRAIN
 
-#: Coefficients of the quintic Newton-Schulz iteration towards the nearest orthogonal matrix (Jordan et al., "Muon", 2024).
-_QUINTIC = (3.4445, -4.7750, 2.0315)
-#: Root mean square of Adam's updates in units of its rate, about: both parts then share one rate (Liu et al., 2025).
-_ADAM_RMS = 0.2
-
-
-#: Names for :func:`make_optimizer`.
-OPTIMIZERS = ("adam", "muon")
 #: What an update is led by, see :class:`TrainerSettings`.
 SIGNALS = ("potential", "scaled", "scaled_by_frame")
-
-
-def make_optimizer(
-    name: str, simulator: NetworkStepper, learning_rate: float, on_device: bool = False
-) -> torch.optim.Optimizer:
-    """``adam``, or ``muon`` for the matrices between latents with Adam for encoders' inputs, outputs, biases and norms.
-
-    Args:
-        on_device: the steps of Adam are counted beside the weights, where there is a device beside the CPU.
-    """
-    if name == "adam":
-        on_device &= simulator.gravity.device.type != "cpu"
-        return torch.optim.Adam(simulator.parameters(), lr=learning_rate, capturable=on_device)
-    width = int(simulator.config["latent_dim"])
-    inner = [p for p in simulator.parameters() if p.dim() == 2 and p.shape[0] == width and p.shape[1] % width == 0]
-    chosen = {id(p) for p in inner}
-    rest = [p for p in simulator.parameters() if id(p) not in chosen]
-    return MuonAdam([{"params": inner, "matrices": True}, {"params": rest, "matrices": False}], learning_rate)
-
-
-def load_optimizer(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """The state of a checkpoint; where steps are counted stays as it is."""
-    own = [{name: group[name] for name in ("capturable",) if name in group} for group in optimizer.param_groups]
-    groups = [{**given, **kept} for given, kept in zip(state["param_groups"], own, strict=True)]
-    optimizer.load_state_dict({**state, "param_groups": groups})
-
-
-class MuonAdam(torch.optim.Optimizer):
-    """Muon for groups marked ``matrices``, Adam for the others, at one learning rate.
-
-    The matrices (d, k d) of a group are taken apart into k square blocks: a first layer sees k latents, one beside the
-    other. All blocks are orthogonalised together and in float32; torch's own Muon takes a matrix at a time, whole.
-    """
-
-    def __init__(
-        self,
-        groups: Iterable[dict[str, Any]],
-        lr: float,
-        betas: tuple[float, float] = (0.9, 0.999),
-        momentum: float = 0.95,
-        eps: float = 1e-8,
-    ) -> None:
-        super().__init__(groups, {"lr": lr, "betas": betas, "momentum": momentum, "eps": eps, "matrices": False})
-
-    @torch.no_grad()
-    def step(self, closure: Any = None) -> None:  # type: ignore[override]
-        """One update of every parameter that has a gradient."""
-        for group in self.param_groups:
-            present = [p for p in group["params"] if p.grad is not None]
-            if group["matrices"]:
-                self._orthogonal(group, present)
-            else:
-                self._adam(group, present)
-
-    def _orthogonal(self, group: dict[str, Any], params: list[Tensor]) -> None:
-        if not params:
-            return
-        momentum, grads = group["momentum"], [cast(Tensor, p.grad) for p in params]
-        kept = self._kept("momentum", params)
-        torch._foreach_lerp_(kept, grads, 1.0 - momentum)
-        ahead = torch._foreach_lerp(grads, kept, momentum)
-        blocks = orthogonal(torch.stack([block for one in ahead for block in one.split(one.shape[0], dim=1)]))
-        places = [block for p in params for block in p.split(p.shape[0], dim=1)]
-        torch._foreach_add_(places, list(blocks.unbind()), alpha=-group["lr"] * _ADAM_RMS * blocks.shape[1] ** 0.5)
-
-    def _adam(self, group: dict[str, Any], params: list[Tensor]) -> None:
-        if not params:
-            return
-        (first, second), grads = group["betas"], [cast(Tensor, p.grad) for p in params]
-        means, squares = self._kept("first", params), self._kept("second", params)
-        for p in params:
-            self.state[p]["step"] = self.state[p].get("step", 0) + 1
-        counts = [self.state[p]["step"] for p in params]
-        torch._foreach_lerp_(means, grads, 1.0 - first)
-        torch._foreach_mul_(squares, second)
-        torch._foreach_addcmul_(squares, grads, grads, value=1.0 - second)
-        roots = torch._foreach_div(squares, [1.0 - second**count for count in counts])
-        torch._foreach_sqrt_(roots)
-        torch._foreach_add_(roots, group["eps"])
-        torch._foreach_addcdiv_(params, means, roots, [-group["lr"] / (1.0 - first**count) for count in counts])
-
-    def _kept(self, name: str, params: list[Tensor]) -> list[Tensor]:
-        """What is kept of every parameter under a name, zero at first."""
-        for p in params:
-            if name not in self.state[p]:
-                self.state[p][name] = torch.zeros_like(p)
-        return [self.state[p][name] for p in params]
-
-
-def orthogonal(blocks: Tensor, rounds: int = 5) -> Tensor:
-    """Near-orthogonal matrices with the singular directions of ``blocks`` (K, d, d)."""
-    a, b, c = _QUINTIC
-    x = blocks / blocks.norm(dim=(1, 2), keepdim=True).clamp_min(1e-20)
-    for _ in range(rounds):
-        gram = x @ x.mT
-        x = a * x + (b * gram + c * gram @ gram) @ x
-    return x
 
 
 def make_whitening(simulator: NetworkStepper, on: bool) -> Whitening:
@@ -161,6 +56,8 @@ class TrainerSettings:
     1 + rg / 3, so that one broken scene does not drown the others.
     ``"scaled_by_frame"`` gives the relaxing step the e0 of a frame of 1/30 s, a hundredth of its own: the gradients of both
     kinds of steps are then of one size.
+    ``optimizer``: a word, or a class with its arguments, ``partial(torch.optim.AdamW, weight_decay=1e-2)``; ``schedule``: a
+    function of the iteration, or a scheduler in the same form; see :mod:`hood.training.optimiser`.
     ``whitening``: see :class:`hood.model.features.normalizer.Whitening`.
     ``max_skipped``: updates without a finite loss and gradient in a row after which training goes back to the last good
     checkpoint, on other scenes; ``max_rollbacks``: how often it does so without getting any further.
@@ -183,7 +80,7 @@ class TrainerSettings:
     iterations: int = 150_000
     batch_size: int = 1
     learning_rate: float = 5e-5
-    schedule: StepDecay | WarmupCosine | InverseRoot = field(default_factory=StepDecay)
+    schedule: Schedule | partial[Any] = field(default_factory=StepDecay)
     horizon: Horizon = field(default_factory=Horizon)
     collision: CollisionRamp = field(default_factory=lambda: CollisionRamp(5e3, 5e5, 50_000, 150_000))
     by_rollout: bool = False
@@ -192,7 +89,7 @@ class TrainerSettings:
     clip_norm: float = 1.0
     signal: str = "potential"
     whitening: bool = False
-    optimizer: str = "adam"
+    optimizer: str | partial[Any] = "adam"
     ema_decay: float = 0.0
     precision: str = "fp32"
     kernels: str = "torch"
@@ -216,8 +113,8 @@ class TrainerSettings:
             raise ValueError(f"trainer.kernels {self.kernels!r}: give {' or '.join(map(repr, (AUTO, *KERNELS)))}")
         if self.step not in _STEPS:
             raise ValueError(f"trainer.step {self.step!r}: give {' or '.join(map(repr, _STEPS))}")
-        if self.optimizer not in OPTIMIZERS:
-            raise ValueError(f"trainer.optimizer {self.optimizer!r}: give {' or '.join(map(repr, OPTIMIZERS))}")
+        _check_optimizer(self.optimizer)
+        _check_schedule(self.schedule, self.validate_every > 0)
         if self.signal not in SIGNALS:
             raise ValueError(f"trainer.signal {self.signal!r}: give {' or '.join(map(repr, SIGNALS))}")
         if self.whitening and self.statistics_iterations == 0:
@@ -253,6 +150,14 @@ class TrainerSettings:
         """
         return self.horizon.rollout(iteration) if self.by_rollout else iteration
 
+    def require_updates(self, uses_statistics: bool) -> None:
+        """Raise ValueError where all iterations would only collect the statistics of a model that has some."""
+        if uses_statistics and self.iterations <= self.statistics_iterations:
+            raise ValueError(
+                f"trainer.iterations={self.iterations}: the first {self.statistics_iterations} only collect "
+                "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
+            )
+
     def is_due(self, iteration: int) -> bool:
         """Whether something follows an iteration for which it must be known what came of the updates so far."""
         every = (self.log_every, self.checkpoint_every, self.validate_every)
@@ -273,11 +178,53 @@ class TrainerSettings:
                 f"trainer.time_scale={self.time_scale:g} leaves {iterations} iterations, of which the first "
                 f"{self.statistics_iterations} only collect statistics; raise it"
             )
+        scale = getattr(self.schedule, "scaled", None)
+        if scale is None:
+            name = dotted_name(self.schedule.func if isinstance(self.schedule, partial) else type(self.schedule))
+            raise ValueError(
+                f"trainer.time_scale={self.time_scale:g}: trainer.schedule is of {name}, which has no method scaled(factor); "
+                "give trainer.time_scale=1"
+            )
         return replace(
             self,
             time_scale=1.0,
             iterations=iterations,
-            schedule=self.schedule.scaled(self.time_scale),
+            schedule=scale(self.time_scale),
             horizon=self.horizon.scaled(self.time_scale),
             collision=self.collision.scaled(self.time_scale),
         )
+
+
+def _check_optimizer(choice: str | partial[Any]) -> None:
+    """Raise ValueError where ``trainer.optimizer`` is neither a word nor the class of an optimiser that a training can use."""
+    if isinstance(choice, str):
+        if choice not in OPTIMIZERS:
+            raise ValueError(
+                f"trainer.optimizer {choice!r}: give {' or '.join(map(repr, OPTIMIZERS))}, or a class, such as "
+                "{_target_: torch.optim.AdamW}"
+            )
+        return
+    kind = _class_of("trainer.optimizer", choice, torch.optim.Optimizer)
+    if "lr" in choice.keywords:
+        raise ValueError("trainer.optimizer.lr: the rate is trainer.learning_rate, times trainer.schedule; leave lr out")
+    closure = inspect.signature(kind.step).parameters.get("closure")
+    if kind is torch.optim.SparseAdam or (closure is not None and closure.default is inspect.Parameter.empty):
+        needed = "sparse gradients" if kind is torch.optim.SparseAdam else "to compute the loss several times in a step"
+        raise ValueError(f"trainer.optimizer: {dotted_name(kind)} needs {needed}; give another one, such as torch.optim.AdamW")
+
+
+def _check_schedule(choice: Schedule | partial[Any], validates: bool) -> None:
+    """Raise ValueError where ``trainer.schedule`` says no rates to a training, which ``validates`` or not."""
+    if not isinstance(choice, partial):
+        if not callable(choice):
+            raise ValueError(f"trainer.schedule: {dotted_name(type(choice))} has no method __call__(iteration, num_iterations)")
+        return
+    if issubclass(_class_of("trainer.schedule", choice, LRScheduler), ReduceLROnPlateau) and not validates:
+        raise ValueError("trainer.schedule: ReduceLROnPlateau reads the score of validations; give trainer.validate_every")
+
+
+def _class_of(key: str, choice: partial[Any], base: type) -> Any:
+    """The class of a part, which must be one of ``base``."""
+    if not (inspect.isclass(choice.func) and issubclass(choice.func, base)):
+        raise ValueError(f"{key}: {dotted_name(choice.func)} is no class of {base.__module__}.{base.__qualname__}")
+    return choice.func

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -24,22 +24,24 @@ from hood.steppers.network import NetworkStepper
 from hood.steppers.protocol import Stopwatch, timed
 from hood.steppers.ranges import training_conditions
 from hood.training import distributed
+from hood.training.callbacks import Callback, Reporter, ValidationWatch
 from hood.training.checkpoint import (
     generator_states,
     load_last_good,
     previous,
     refuse_other,
+    require_plain,
     save_checkpoint,
     set_aside,
     set_generator_states,
 )
-from hood.training.log import Clock, ConstantOutput, LogWindow, MetricsLog, Skipped, made_behind, told
-from hood.training.outcome import Signal, StartedUpdate, Update, WeightSteps, read_figures
+from hood.training.log import Clock, Logger, LogWindow
+from hood.training.optimiser import Rates, WeightSteps, load_optimizer, make_optimizer
+from hood.training.outcome import Signal, Skipped, StartedUpdate, Update, made_behind, read_figures, told
 from hood.training.scenes import SceneSampler
-from hood.training.settings import TrainerSettings, load_optimizer, make_optimizer, make_whitening
+from hood.training.settings import TrainerSettings, make_whitening
 from hood.training.slots import Slots
 from hood.training.updates import Observer, make_captured, plain_update
-from hood.training.watch import ValidationWatch
 
 #: Told the iteration and what was measured; None instead of a report: time passed that was not training.
 _Progress = Callable[[int, dict[str, float] | None], None]
@@ -65,13 +67,11 @@ class Trainer:
         seed: int,
         watch: ValidationWatch | None = None,
         earlier: int = 0,
+        loggers: Sequence[Logger] | None = None,
+        callbacks: Sequence[Callback] = (),
     ) -> None:
         settings = settings.compressed()
-        if settings.iterations <= settings.statistics_iterations and simulator.uses_statistics:
-            raise ValueError(
-                f"trainer.iterations={settings.iterations}: the first {settings.statistics_iterations} only collect "
-                "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
-            )
+        settings.require_updates(simulator.uses_statistics)
         settings.collision.require_its_weight(potential)
         shown = for_networks(potential)
         simulator.use_potential(shown)
@@ -104,16 +104,17 @@ class Trainer:
                     module.shared_sum = distributed.all_reduce_sum
         self._captured = make_captured(simulator, settings, self.slots.ending_strain, self.slots.most_scenes, ranks)
         self.optimizer = make_optimizer(settings.optimizer, simulator, settings.learning_rate, self._captured is not None)
+        self._rates = Rates(settings.schedule, self.optimizer, settings.learning_rate, settings.iterations)
         self.iteration, self.earlier, self.rollbacks, self.best = 0, earlier, 0, math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: Observer | None = None
-        self._constant = ConstantOutput(settings.learning_rate)
         self._skips = Skipped()
         self._rollbacks_in_row, self._failed_at, self._saved_at = 0, -1, -1
-        self._metrics: MetricsLog | None = None
-        self._window = LogWindow()
+        self.stopped = ""  # why a callback ended the training
+        self.reporter = Reporter(self, loggers, callbacks)
         self._steps = WeightSteps(simulator, self.optimizer, self.whitening, settings.ema_decay)
         self._begun: list[StartedUpdate] = []  # updates that :meth:`look` has not told of
+        self.reporter.call("check")
 
     @property
     def checkpoint_path(self) -> Path:
@@ -134,7 +135,7 @@ class Trainer:
         return told(distributed.gather(self._skips.reason))
 
     def run(self, progress: _Progress | None = None, should_stop: Callable[[], bool] = lambda: False) -> bool:
-        """Train up to ``settings.iterations``; True when finished, False when ``should_stop`` ended it early.
+        """Train up to ``settings.iterations``; True when finished or a callback stopped it, False when ``should_stop`` did.
 
         Raises:
             OSError: a file could not be written; what was written before is intact.
@@ -143,11 +144,12 @@ class Trainer:
         settings = self.settings
         with ExitStack() as stack:
             stack.callback(self.slots.close)
-            distributed.on_main(lambda: self._open_log(stack))
+            distributed.on_main(lambda: self.reporter.open(stack))
+            self.reporter.call("begin")
             if self.iteration == 0 and self._saved_at != 0:
                 self.save()  # something to go back to, and a full disk shows at once
             clock = Clock(self.iteration)
-            while self.iteration < settings.iterations and (self._begun or not distributed.any_rank(should_stop())):
+            while self.iteration < settings.iterations and (self._begun or not self._ends(should_stop)):
                 self.begin()
                 if self._reads_late and not settings.is_due(self.iteration):
                     continue
@@ -159,13 +161,9 @@ class Trainer:
                     self._roll_back()
                     clock = Clock(self.iteration)
                     continue
-                for report in reports:
-                    self._window.add(report)
+                self.reporter.add(reports)
                 if last or self.iteration % settings.log_every == 0:
-                    means = self._window.close()
-                    self._log({**means, "iterations_per_second": clock.rate(self.iteration)})
-                    if distributed.rank() == 0:
-                        self._constant.look(self.iteration, means["output_spread"])
+                    self.reporter.write_means(clock.rate(self.iteration))
                 if progress is not None:
                     progress(self.iteration, reports[-1])
                 if self.watch is not None and settings.validate_every and self.iteration % settings.validate_every == 0:
@@ -179,13 +177,18 @@ class Trainer:
                     distributed.on_main(self._keep)
             if self.iteration != self._saved_at and not self._is_lost(True):
                 self.save()
+            self.reporter.call("end")
         finished = self.iteration >= settings.iterations
         if finished and not self._skips.made:
             raise ValueError(
                 f"nothing was trained: {self.skipped} of {self.skipped} updates were skipped{self.why_skipped()}; "
                 f"{self.folder / 'model.safetensors'} holds the weights that it began with"
             )
-        return finished
+        return finished or bool(self.stopped)
+
+    def stop(self, reason: str) -> None:
+        """End the training after this iteration, as finished; for callbacks."""
+        self.stopped = self.stopped or reason
 
     def update(self) -> dict[str, float]:
         """One step of every slot and one optimiser update; returns what was measured."""
@@ -214,6 +217,7 @@ class Trainer:
                 begun.taken = self.slots.advance_unread(update.next_pos, update.next_vel, update.acceptance.goes_on)
             else:
                 self.slots.advance(update.next_pos, update.next_vel, begun.figures.lost, begun.figures.centres)
+        self._rates.advance()
         self.iteration += 1
         self._begun.append(begun)
 
@@ -294,14 +298,19 @@ class Trainer:
             "simulator": self.simulator.state_dict(),
             "average": self._steps.average,
             "optimizer": self.optimizer.state_dict(),
+            "rates": self._rates.state_dict(),
             "whitening": self.whitening.state_dict() if self.settings.whitening else None,
             "slots": slots,
             "rng": generators,
-            "window": distributed.gather(self._window.state_dict()),
+            "window": distributed.gather(self.reporter.window.state_dict()),
+            "callbacks": self.reporter.callback_states(),
             "model": self.simulator.config,
         }
+        require_plain("trainer.schedule", state["rates"])
+        require_plain("callbacks", state["callbacks"])
         distributed.on_main(lambda: self._write(state))
         self._saved_at = self.iteration
+        self.reporter.call("after_checkpoint", self.iteration)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of a run with the same model and data, on any number of processes.
@@ -325,7 +334,7 @@ class Trainer:
         self.rollbacks, self._rollbacks_in_row, self._failed_at = state["rollbacks"]
         if len(state["rng"]) == distributed.world_size():
             set_generator_states(state["rng"][distributed.rank()], self._device)
-            self._window.load_state_dict(state["window"][distributed.rank()])
+            self.reporter.window.load_state_dict(state["window"][distributed.rank()])
 
     @property
     def _reads_late(self) -> bool:
@@ -339,10 +348,6 @@ class Trainer:
     @property
     def _device(self) -> torch.device:
         return self.simulator.gravity.device
-
-    def _open_log(self, stack: ExitStack) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._metrics = stack.enter_context(MetricsLog(self.folder, self.iteration))
 
     def _write(self, state: dict[str, Any]) -> None:
         save_checkpoint(self.checkpoint_path, state)
@@ -361,6 +366,8 @@ class Trainer:
         for name, mean in self._steps.average.items():
             mean.copy_(state["average"][name])
         load_optimizer(self.optimizer, state["optimizer"])
+        self._rates.load_state_dict(state.get("rates"))
+        self.reporter.give_states(state.get("callbacks", ()))
         self.whitening.load_state_dict(state.get("whitening"))
         self.iteration = int(state["iteration"])
         self._skips.made = made_behind(state)
@@ -388,39 +395,31 @@ class Trainer:
         self._restore(state)
         self.slots.restart()
         self.optimizer.zero_grad(set_to_none=True)
-        self._window = LogWindow()
+        self.reporter.window = LogWindow()
         self._skips.in_row = 0
         self.rollbacks, self._rollbacks_in_row = self.rollbacks + 1, self._rollbacks_in_row + 1
         self._failed_at = max(failed, self._failed_at)
         if distributed.rank() == 0:
             say(f"hood: iteration {failed} is not finite; back to iteration {self.iteration}, other scenes", error=True)
         note = {"rolled_back_from": float(failed), "rollbacks": float(self.rollbacks), "skipped": float(self.skipped)}
-        self._log(note, cut=True)
+        self.reporter.write(note, cut=True)
 
-    def _log(self, report: dict[str, float], cut: bool = False) -> None:
-        """One record of what all processes measured; ``cut`` drops those of later iterations."""
-        report = distributed.mean(report)
-
-        def write() -> None:
-            assert self._metrics is not None
-            if cut:
-                self._metrics.cut(self.iteration)
-            self._metrics.write(self.iteration, report)
-
-        distributed.on_main(write)
+    def _ends(self, should_stop: Callable[[], bool]) -> bool:
+        """Whether training ends here although iterations are left."""
+        return distributed.any_rank(should_stop() or bool(self.stopped))
 
     def _validate(self) -> None:
         """Validation rollouts; the weights that did best so far are kept."""
         assert self.watch is not None
         averaged = self.averaged()
         values, strip = self.watch(averaged, self.iteration)
-        self._log({f"validation_{name}": value for name, value in values.items()})
-        if self._metrics is not None and strip is not None:
-            self._metrics.picture(self.iteration, "validation", strip)
+        record = self.reporter.write({f"validation_{name}": value for name, value in values.items()}, picture=strip)
         if values["score"] < self.best:
             self.best = values["score"]
             header = {"iteration": self._iterations_in_all, "validation": json.dumps(values)}
             distributed.on_main(lambda: save_simulator(self.folder / "best.safetensors", averaged, header))
+        self._rates.judge(values["score"])
+        self.reporter.call("after_validation", self.iteration, record)
 
     def _answer(self, update: Update) -> Tensor:
         """The norm () of the update's gradients before it is shortened, which also tells infinite ones."""
@@ -434,10 +433,7 @@ class Trainer:
     def _optimise(self, begun: StartedUpdate, norm: Tensor) -> None:
         """One step of the optimiser, if energies and the gradients' ``norm`` () are finite."""
         settings, acceptance = self.settings, begun.update.acceptance
-        rate = settings.learning_rate * settings.schedule(self.iteration, settings.iterations)
-        begun.settings["learning_rate"] = rate
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        begun.settings["learning_rate"] = self._rates.put(self.iteration)
         with timed(self.stopwatch, "optimiser"):
             clip_grads_with_norm_(self.simulator.parameters(), settings.clip_norm, norm)
             if acceptance is not None:

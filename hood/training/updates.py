@@ -27,6 +27,7 @@ from hood.steppers.static_shapes.problem import altered, problem_from, settled_p
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
 from hood.tensors.precision import products
 from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
+from hood.training.optimiser import can_be_taken_back
 from hood.training.outcome import TOLD, Acceptance, Figures, Signal, Update, figures_of, outcome_of
 from hood.training.settings import TrainerSettings
 from hood.training.slots import TrainingStep
@@ -345,6 +346,8 @@ def make_captured(
         ValueError: what is asked for cannot be had.
     """
     mode, refused = settings.step, refusal(simulator, settings.collision)
+    if not can_be_taken_back(settings.optimizer):
+        refused = "steps of trainer.optimizer must be undone on the device, which adam, muon, torch.optim.Adam and AdamW can"
     if ranks > 1 or settings.activation_checkpointing:
         refused = "several processes and trainer.activation_checkpointing have updates operation by operation alone"
     if mode == "auto":

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from workshop import write_obj
+from workshop import Workshop, write_obj
 
 from hood.app.settings.compose import load_config
 from hood.app.settings.rollout_settings import RolloutSettings
@@ -56,6 +56,16 @@ def test_the_rollout_on_a_mesh_runs(
     command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
     config = load_config(command, words)
     assert (config.garment, config.body) == ("Röckchen_prepared.npz", name)
+
+
+def test_the_rollout_is_on_the_body_that_the_garment_was_prepared_for(
+    garments: dict[str, Garment], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_obj(Path("tank.obj"), garments["tank"].worn_pos, garments["tank"].faces)
+    body = Workshop(tmp_path).body("smplx_npz")
+    assert main(["prepare", "garment=tank.obj", f"body={body}"]) == 0
+    command, *words = printed(capsys.readouterr().out.splitlines()[-1], "run it with: ")
+    assert words == ["garment=tank_prepared.npz", f"body={body}"]
 
 
 def test_the_rollout_on_a_mesh_has_its_unit_and_axis(

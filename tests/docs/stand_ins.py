@@ -52,11 +52,12 @@ class Desk:
             (r"garments_dict\.pkl", self.published_garments),
             (r"vto/\w+\.csv", self.split),
             (r"(my_)?shirt\.obj|cape \(1\)\.obj|Röckchen\.obj", self.shirt),
-            (r"shirt\.npz", self.bound_shirt),
+            (r"(my_)?shirt\.npz", self.bound_shirt),
             (r"coat\.(obj|ply)|left\.txt|right\.txt", self.coat),
             (r"(my_)?walk\.npz|my_amass_file\.npz|amass(/.*)?", self.recording),
             (r"(first|second)\.txt", self.list_of_motions),
             (r"rows\.csv", self.rows),
+            (r"split\.json", self.split_of_motions),
             (r"hero\.glb", self.hero),
             (r"models/SMPLX_NEUTRAL\.npz", self.smplx),
             (r"pieces/.*\.npz", self.piece),
@@ -200,6 +201,17 @@ class Desk:
         """One of the two recordings in the folder ``amass``."""
         entry = "amass/01_poses.npz" if name == "first.txt" else "amass/02_poses.npz"
         return self._once(name, lambda folder: (folder / name).write_text(entry, encoding="utf-8")) / name
+
+    def split_of_motions(self, name: str, words: Sequence[str]) -> Path:
+        """The split of the page about own files, with the folders that it names."""
+        (text,) = [block.text for block in blocks(ROOT / "docs" / "own_data.md") if block.language == "json"]
+
+        def make(folder: Path) -> None:
+            for place in ("CMU", "ACCAD/01"):
+                shutil.copytree(self.recording("amass", words), folder / "amass" / place)
+            (folder / name).write_text(text, encoding="utf-8")
+
+        return self._once("split", make)
 
     def rows(self, name: str, words: Sequence[str]) -> Path:
         text = "garment,sequence,size\ntank,plie,1.05\n"

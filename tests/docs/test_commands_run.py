@@ -26,6 +26,8 @@ LINES = [(page, line) for page, line in command_lines() if of_hood(line) and not
 LINES += [("Makefile", line) for line in RECIPES]
 #: What makes a rollout short.
 TWO_FRAMES = ("num_frames=2", "video=none", "sheet=false")
+#: What makes a validation short.
+VALIDATED = ("trainer.validate_every=1", "data.validation_frames=3", "validation_states=0")
 
 
 class Short(NamedTuple):
@@ -48,6 +50,8 @@ SHORT = (
         "^train.*paper_fast.*time_scale=0.13", ("trainer.iterations=15", "trainer.statistics_iterations=1"),
         "one update after one that counts features",
     ),
+    Short(r"^train.*split\.json", ("trainer.horizon.maximum=2", *VALIDATED), "the motions of these files have ten frames"),
+    Short("^train.*EarlyStopping", ("data.garments=[tank]", *VALIDATED), "one validation, of one garment"),
     Short("^train.*time_scale=0.02", ("trainer.iterations=50",), "a fiftieth of which is one update"),
     Short("^evaluate.*garments_dict", ("num_frames=4", "gap_states=1", "gap_iterations=2"), "the least number of frames"),
     Short(

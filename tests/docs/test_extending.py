@@ -39,7 +39,10 @@ SHORT = {
     "evaluate": ["garments=[tank]", "num_frames=4", "gap_states=0"],
     "prepare": [],
 }  # fmt: skip
-RECIPES = ("An energy", "A fabric", "A group of features", "An output and a network", "A stepper", "A file format")
+RECIPES = (
+    *("An energy", "A fabric", "A group of features", "An output and a network", "A stepper", "A file format"),
+    *("An optimiser and a schedule", "A logger", "A callback", "A data set"),
+)
 
 
 def sections() -> dict[str, str]:
@@ -169,6 +172,46 @@ def test_a_trained_model_says_what_it_needs(
     assert told.count("\n") == 1
     assert "from the package my-cloth 1.0, which is not installed here; install my-cloth" in told
     assert "my_cloth" not in sys.modules
+
+
+def test_scenes_of_a_package_are_the_same_by_workers_and_after_an_interruption(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its sampler, rates and callback as well."""
+    monkeypatch.setattr("hood.training.prefetch._WARM_UP", 0)
+    parts = ["trainer.optimizer={_target_: my_cloth.rates.Signed}", "trainer.schedule={_target_: my_cloth.rates.Sawtooth}"]
+    words = ["train", "model=small", "data=tall", *parts, "trainer.horizon.start=1", "trainer.iterations=5"]
+    kept = "callbacks=[{_target_: my_cloth.enough.Enough, loss: 1e9, times: 4}]"
+    for name, workers in (("alone", 0), ("helped", 1)):
+        assert run([*words, f"trainer.workers={workers}", f"output=runs/{name}", kept]) == 0
+    stopped = [*words, "output=runs/parts"]
+    assert run([*stopped, kept.replace("4", "2")]) == 0
+    assert run([*stopped, "resume=true"]) == 0  # without the callback
+    losses = [
+        [json.loads(line)["loss"] for line in Path(f"runs/{name}/metrics.jsonl").read_text().splitlines()]
+        for name in ("alone", "helped", "parts")
+    ]
+    assert losses[0] == losses[1]
+    assert (len(losses[0]), len(losses[2])) == (4, 5)
+    assert losses[2][:4] == losses[0]
+
+
+def test_an_option_of_data_without_the_usual_keys_is_refused(installed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    option = installed / "my_cloth" / "configs" / "data" / "tall.yaml"
+    option.write_text("_target_: my_cloth.tall.Tall\n", encoding="utf-8")
+    short = [word for word in SHORT["train"] if not word.startswith("data.")]
+    assert main(["train", "model=small", "data=tall", *short, "output=run"]) == 2
+    told = "data.body is missing; let the option begin with defaults: [default, _self_]"
+    assert told in capsys.readouterr().err
+    assert not Path("run").exists()
+
+
+def test_a_data_set_of_another_class_is_refused(installed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    option = installed / "my_cloth" / "configs" / "data" / "other.yaml"
+    option.write_text("defaults: [default, _self_]\n_target_: my_cloth.speed.Speed\n", encoding="utf-8")
+    assert run(["train", "model=small", "data=other", "output=run"]) == 2
+    assert "data: my_cloth.speed.Speed is no class of hood.training.scenes.SceneSampler" in capsys.readouterr().err
+    assert not Path("run").exists()
 
 
 def test_models_of_hood_alone_name_no_package(tmp_path: Path) -> None:

@@ -13,7 +13,10 @@ import h5py
 import pytest
 from test_extending import blocks, sections, write_package
 
-OPTIONS = {f"my_cloth/configs/{name}.yaml" for name in ("losses/windy", "material/felt", "model/bounded", "stepper/damped")}
+OPTIONS = {
+    f"my_cloth/configs/{name}.yaml"
+    for name in ("losses/windy", "material/felt", "model/bounded", "stepper/damped", "data/tall")
+}
 #: Another table [build-system] of the page stands for the first one.
 _BUILDER = re.compile(r"\[build-system\]\n.*?\n\n", re.DOTALL)
 

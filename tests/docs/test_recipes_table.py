@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,19 @@ def test_what_the_text_below_says(experiment: str) -> None:
     assert (config.trainer.optimizer == "adam") == of_paper
     assert config.data.sampling.mirror == config.data.sampling.random_yaw == (not of_paper)
     assert (config.losses == load_config("train", ["losses=reference_as_coded"]).losses) == (experiment == "released")
+
+
+def test_the_page_about_own_files_has_every_key_of_data_with_a_value_that_it_takes() -> None:
+    rows = [
+        [re.findall(r"`([^`]+)`", cell) for cell in line.split("|")[1:3]]
+        for line in PAGE.with_name("own_data.md").read_text(encoding="utf-8").splitlines()
+        if line.startswith("| `data.")
+    ]
+    words = [f"{key}={value}" for keys, values in rows for key, value in zip(keys, values, strict=True)]
+    data = plain(load_config("train", words).data)
+    sampling = data.pop("sampling")
+    expected = [*(f"data.{key}" for key in data), *(f"data.sampling.{key}" for key in sampling)]
+    assert sorted(word.partition("=")[0] for word in words) == sorted(expected)
 
 
 def differences(first: dict, second: dict, path: str) -> set[str]:

@@ -11,7 +11,7 @@ from hood.cloth.state import State, StepInput
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.testing import grid
-from hood.training.log import relative_loss
+from hood.training.outcome import relative_loss
 
 
 def test_the_loss_does_not_depend_on_where_the_scene_is() -> None:

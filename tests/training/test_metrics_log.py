@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import json
 import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
-from hood.training.log import LogWindow, MetricsLog
+from hood.training.log import Csv, Logger, LogWindow, MetricsLog, TensorBoard, Wandb
 
 
 def read(folder: Path) -> list[dict]:
@@ -68,7 +72,9 @@ def test_tensorboard_alone_does_not_end_a_run(tmp_path: Path, capsys: pytest.Cap
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with MetricsLog(tmp_path, 0) as log:
-        log._board = Full()
+        board = TensorBoard()
+        board._board = Full()  # type: ignore[attr-defined]
+        log._loggers = [board]
         log.write(1, {"total": 1.0, "loss": 2.0})
         log.write(2, {"total": 1.0})
     assert [record["iteration"] for record in read(tmp_path)] == [1, 2]
@@ -113,3 +119,83 @@ def test_a_window_is_the_mean_of_its_updates() -> None:
     assert window.close() == {"loss": 3.0}
     window.add({"loss": float("inf")})
     assert window.close() == {"loss": float("inf")}
+
+
+def test_a_table_gets_columns_as_they_come_and_is_cut_on_resume(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, 0, [Csv()]) as log:
+        log.write(1, {"loss": 0.5})
+        log.write(2, {"loss": 0.25})
+        log.write(2, {"validation_score": 7.0})
+        log.write(3, {"loss": float("nan")})
+        log.cut(2)
+        log.write(3, {"loss": 0.125})
+        log.write(4, {"loss": 0.5})
+    with MetricsLog(tmp_path, 3, [Csv()]) as log:  # the run was killed after its checkpoint at 3
+        log.write(4, {"loss": 1.0})
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows == [
+        ["iteration", "loss", "validation_score"],
+        ["1", "0.5", ""], ["2", "0.25", ""], ["2", "", "7.0"], ["3", "0.125", ""], ["4", "1.0", ""],
+    ]  # fmt: skip
+
+
+def test_a_table_that_begins_late_has_all_records(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, 0, []) as log:
+        log.write(1, {"loss": 0.5})
+        log.write(2, {"loss": float("inf")})
+    with MetricsLog(tmp_path, 2, [Csv()]):
+        pass
+    assert (tmp_path / "metrics.csv").read_text() == "iteration,loss\n1,0.5\n2,\n"
+
+
+def test_a_logger_that_raises_is_dropped_and_the_others_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    class Broken(Logger):
+        def write(self, iteration: int, values: Any) -> None:
+            raise RuntimeError("no\nconnection")
+
+    with MetricsLog(tmp_path, 0, [Broken(), Csv()]) as log:
+        log.write(1, {"loss": 0.5})
+        log.write(2, {"loss": 0.25})
+    told = capsys.readouterr().err
+    assert told == f"hood: no more figures for the logger Broken: no connection; all numbers are in {tmp_path}/metrics.jsonl\n"
+    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
+
+
+def test_one_offline_run_holds_each_record_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the package, which writes what it is told into folders as that does."""
+    begun: list[dict[str, Any]] = []
+
+    def init(**options: Any) -> SimpleNamespace:
+        folder = Path(options["dir"]) / "wandb" / f"offline-run-{len(begun)}"
+        folder.mkdir(parents=True)
+        begun.append(options)
+
+        def write(values: dict[str, float], step: int) -> None:
+            with open(folder / "log", "a") as file:
+                file.write(f"{step} {json.dumps(values)}\n")
+
+        return SimpleNamespace(log=write, finish=lambda: (folder / "finished").touch())
+
+    stand_in = ModuleType("wandb")
+    stand_in.__spec__ = ModuleSpec("wandb", None)
+    stand_in.init, stand_in.Settings = init, dict  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "wandb", stand_in)
+    for first, last in ((0, 4), (2, 3)):
+        logger = Wandb(project="shirts")
+        logger.config = {"seed": 3}
+        with MetricsLog(tmp_path, first, [logger]) as log:
+            for iteration in range(first + 1, last + 1):
+                log.write(iteration, {"loss": 10.0 * last + iteration})
+    (folder,) = (tmp_path / "wandb").iterdir()
+    assert (folder / "log").read_text() == '1 {"loss": 41.0}\n2 {"loss": 42.0}\n3 {"loss": 33.0}\n'
+    assert (folder / "finished").exists()
+    assert {(one["mode"], one["project"], one["name"], one["config"]["seed"]) for one in begun} == {
+        ("offline", "shirts", tmp_path.name, 3)
+    }
+
+
+def test_a_logger_whose_package_is_missing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hood.training.log.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r'wandb is not installed \(pip install "hood-cloth\[wandb\]"\)'):
+        Wandb()

@@ -5,7 +5,7 @@ from copy import deepcopy
 import torch
 
 from hood.steppers.network import build_simulator
-from hood.training.settings import MuonAdam, make_optimizer, orthogonal
+from hood.training.optimiser import MuonAdam, make_optimizer, orthogonal
 
 
 def test_updates_of_matrices_are_nearly_orthogonal():

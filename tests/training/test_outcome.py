@@ -20,9 +20,10 @@ from hood.model.graph.static_shapes import Capacity
 from hood.steppers.network import NetworkStepper, build_simulator
 from hood.training import updates
 from hood.training.curriculum import CollisionRamp, Horizon, StepDecay
-from hood.training.outcome import StartedUpdate, WeightSteps, read_figures
+from hood.training.optimiser import WeightSteps, make_optimizer
+from hood.training.outcome import StartedUpdate, read_figures
 from hood.training.scenes import SceneSampler
-from hood.training.settings import TrainerSettings, make_optimizer, make_whitening
+from hood.training.settings import TrainerSettings, make_whitening
 from hood.training.trainer import Trainer
 from hood.training.updates import CapturedUpdates
 

@@ -19,7 +19,7 @@ from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import build_simulator
 from hood.training.checkpoint import load_checkpoint, previous
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
-from hood.training.log import Skipped, told
+from hood.training.outcome import Skipped, told
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
@@ -225,8 +225,8 @@ def test_a_full_disk_ends_training_with_the_last_checkpoint_intact(name: str, tm
         if iteration == 5:
             (tmp_path / f"{name}.partial").symlink_to("/dev/full")
             if name == "metrics.jsonl":
-                assert trainer._metrics is not None
-                trainer._metrics._file = open("/dev/full", "ab", buffering=0)
+                assert trainer.reporter._metrics is not None
+                trainer.reporter._metrics._file = open("/dev/full", "ab", buffering=0)
 
     with pytest.raises(OSError, match=name) as error:
         trainer.run(fill)

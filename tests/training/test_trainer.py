@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import (
+    CosineAnnealingLR,
+    LinearLR,
+    MultiStepLR,
+    OneCycleLR,
+    ReduceLROnPlateau,
+    SequentialLR,
+    StepLR,
+)
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
@@ -236,6 +246,12 @@ def assert_same(first: object, second: object) -> None:
         assert first == second
 
 
+#: A warm-up, then a cosine.
+STAGES = partial(
+    SequentialLR,
+    schedulers=[partial(LinearLR, total_iters=4), partial(CosineAnnealingLR, T_max=16)],
+    milestones=[4],
+)
 VARIANTS = {
     "physical": (PHYSICAL, {}),
     "paper": (PAPER, {"signal": "potential"}),
@@ -243,6 +259,15 @@ VARIANTS = {
     "bf16": (PHYSICAL, {"precision": "bf16", "ema_decay": 0.0}),
     "edges": (PHYSICAL | {"output": "edges"}, {}),
     "white": (PAPER, {"signal": "scaled_by_frame", "whitening": True}),
+    "torch": (PHYSICAL, {"optimizer": partial(torch.optim.AdamW, weight_decay=0.1, amsgrad=True), "schedule": STAGES}),
+    "cycle": (
+        PAPER,
+        {"optimizer": partial(torch.optim.SGD, momentum=0.9), "schedule": partial(OneCycleLR, max_lr=0.1, total_steps=20)},
+    ),
+    "fixed": (
+        PHYSICAL,
+        {"optimizer": partial(torch.optim.AdamW), "schedule": partial(MultiStepLR, milestones=[3, 12]), "step": "fixed"},
+    ),
 }
 
 
@@ -342,6 +367,28 @@ def test_kernels_are_those_that_train_fastest_here(
     assert trainer.simulator.network.kernels == "torch"
 
 
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"optimizer": partial(torch.optim.AdamW, weight_decai=0.1)}, "trainer.optimizer: .*did you mean 'weight_decay'"),
+        ({"optimizer": partial(torch.optim.AdamW, weight_decay=-1.0)}, "trainer.optimizer: .*Invalid weight_decay"),
+        ({"schedule": partial(StepLR)}, "trainer.schedule: .*step_size"),
+        ({"optimizer": partial(torch.optim.SGD), "step": "fixed"}, "steps of trainer.optimizer must be undone.*step=plain"),
+    ],
+)
+def test_classes_of_torch_are_refused_with_their_key(options: dict, words: str, tmp_path: Path, sampler: SceneSampler) -> None:
+    with pytest.raises(ValueError, match=words):
+        make(tmp_path / "run", sampler, settings=replace(SETTINGS, **options))
+    assert not (tmp_path / "run").exists()
+
+
+def test_schedulers_of_torch_count_iterations_without_a_step(tmp_path: Path, sampler: SceneSampler) -> None:
+    """Four collect statistics; as functions of the iteration do, the scheduler counts them."""
+    trainer = make(tmp_path, sampler, PAPER, replace(SETTINGS, schedule=partial(StepLR, step_size=3, gamma=0.5)))
+    rates = [trainer.update().get("learning_rate") for _ in range(7)]
+    assert rates == [None, None, None, None, 5e-4, 5e-4, 2.5e-4]
+
+
 def test_the_learning_rate_follows_its_schedule(tmp_path: Path, sampler: SceneSampler) -> None:
     trainer = make(tmp_path, sampler)
     rates = [trainer.update()["learning_rate"] for _ in range(3)]
@@ -395,6 +442,15 @@ def test_a_training_without_whitening_does_not_go_on_with_it(tmp_path: Path, sam
         ({"iterations": 0}, "trainer.iterations"),
         ({"batch_size": 0}, "trainer.batch_size"),
         ({"learning_rate": 0.0}, "trainer.learning_rate"),
+        ({"optimizer": "adamw"}, "give 'adam' or 'muon', or a class"),
+        ({"optimizer": partial(torch.optim.AdamW, lr=1.0)}, "the rate is trainer.learning_rate"),
+        ({"optimizer": partial(torch.optim.LBFGS)}, "LBFGS needs to compute the loss several times"),
+        ({"optimizer": partial(torch.optim.SparseAdam)}, "SparseAdam needs sparse gradients"),
+        ({"optimizer": partial(StepLR, step_size=3)}, "StepLR is no class of torch.optim"),
+        ({"schedule": partial(torch.optim.AdamW)}, "AdamW is no class of torch.optim.lr_scheduler.LRScheduler"),
+        ({"schedule": 0.5}, "no method __call__"),
+        ({"schedule": partial(ReduceLROnPlateau)}, "give trainer.validate_every"),
+        ({"schedule": partial(StepLR, step_size=3), "time_scale": 2.0}, r"StepLR, which has no method scaled"),
     ],
 )
 def test_wrong_settings_are_named(options: dict, word: str) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from hood.energies.potential import default_potential
 from hood.evaluation.gap import REFERENCE
@@ -18,11 +20,11 @@ from hood.evaluation.validation import Validation
 from hood.scene.scene import Scene
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import NetworkStepper, build_simulator
+from hood.training.callbacks import ValidationWatch
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.scenes import SceneSampler
 from hood.training.settings import TrainerSettings
 from hood.training.trainer import Trainer
-from hood.training.watch import ValidationWatch
 
 SETTINGS = TrainerSettings(
     iterations=6, batch_size=1, learning_rate=1e-3, schedule=WarmupCosine(3), horizon=Horizon(every=100, maximum=2, start=2),
@@ -78,6 +80,15 @@ def test_a_resumed_run_knows_what_was_best(tmp_path: Path, sampler: SceneSampler
     assert second.run()
     assert second.best == 1.0
     assert (tmp_path / "best.safetensors").read_bytes() == before
+
+
+def test_a_rate_that_falls_on_a_plateau_reads_the_score(tmp_path: Path, sampler: SceneSampler) -> None:
+    settings = replace(SETTINGS, schedule=partial(ReduceLROnPlateau, patience=0, factor=0.5), iterations=8)
+    trainer = Trainer(tiny(), default_potential(), sampler, settings, tmp_path, 0, Scripted({2: 3.0, 4: 3.0, 6: 1.0, 8: 1.0}))  # type: ignore[arg-type]
+    assert trainer.run()
+    rates = [line["learning_rate"] for line in lines(tmp_path) if "learning_rate" in line]
+    assert rates == [1e-3] * 4 + [5e-4] * 4
+    assert trainer.optimizer.param_groups[0]["lr"] == 2.5e-4
 
 
 def test_models_that_break_are_never_best(tmp_path: Path, sampler: SceneSampler) -> None:

@@ -29,7 +29,7 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 #: Keys that take a table of parts, some beside numbers and lists.
-TABLES = ("size", "size_end", "fabrics", "refine", "metrics", "cloth_contact", "objects")
+TABLES = tuple("size size_end fabrics refine metrics cloth_contact objects trainer.optimizer trainer.schedule".split())
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself.
@@ -125,8 +125,6 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
             _check_sources(config)
             OmegaConf.resolve(config)
             rename_targets(config)
-        except ConfigError:
-            raise
         except (HydraException, OmegaConfBaseException) as error:
             raise ConfigError(f"configuration: {decoded_text(_one_line(error))}") from error
     OmegaConf.set_struct(config, True)
@@ -147,7 +145,9 @@ def _with_keys(known: DictConfig, keys: Sequence[Override]) -> DictConfig | None
         for override in keys:
             if override.type is not OverrideType.CHANGE or override.is_sweep_override() or override.package is not None:
                 return None
-            OmegaConf.update(config, override.key_or_group, override.value(), merge=override.key_or_group not in TABLES)
+            key, value = override.key_or_group, override.value()
+            part = key == "trainer.schedule" and "_target_" not in str(value)  # of the class that is there
+            OmegaConf.update(config, key, value, merge=part or key not in TABLES)
     except OmegaConfBaseException:
         return None
     return config
@@ -363,7 +363,7 @@ def _check_types(name: str, known: DictConfig, config: DictConfig, prefix: str) 
             _check_types(name, before, after, f"{prefix}{key}.")
         elif key in _ONE_OR_MORE and isinstance(after, ListConfig):
             continue
-        elif key in TABLES and isinstance(after, DictConfig):
+        elif f"{prefix}{key}" in TABLES and (isinstance(after, DictConfig) or (key == "optimizer" and isinstance(after, str))):
             continue
         elif after is None and (prefix == _OPTIONAL or key == _FOLDER):
             continue

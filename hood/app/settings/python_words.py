@@ -36,7 +36,7 @@ def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
     """
     words: list[str] = []
     for key, value in keys.items():
-        if isinstance(value, Mapping) and value and (group or key not in TABLES):
+        if isinstance(value, Mapping) and value and f"{group}{key}" not in TABLES:
             words += overrides(value, f"{group}{key}.")
         else:
             words.append(f"{group}{key}={_word(value, group + key)}")

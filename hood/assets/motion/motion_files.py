@@ -94,7 +94,8 @@ class MotionFiles(Sequence[PoseSequence]):
             try:
                 length = frames_by_header(name, fps, file_fps) or load(name).num_frames
                 if length < min_frames:
-                    raise ValueError(f"{name}: {length} frames at {fps:g} fps, at least {min_frames} are needed")
+                    needed = f"at least {min_frames} are needed: trainer.horizon.maximum + 3"
+                    raise ValueError(f"{name}: {length} frames at {fps:g} fps, {needed}")
             except (ValueError, OSError) as error:
                 if not skip:
                     kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError

@@ -103,7 +103,7 @@ def run(overrides: Sequence[str]) -> int:
     if config.mesh is not None:
         write_obj(_mesh_target(config), outfit)
     report = _report(names, fitted, outfit, starts, target)
-    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report))
+    print(json.dumps(report, indent=1) if str(config.format) == "json" else _text(report, str(config.body)))
     return 0
 
 
@@ -295,7 +295,7 @@ def _report(
     }
 
 
-def _text(report: dict[str, Any]) -> str:
+def _text(report: dict[str, Any], body: str) -> str:
     lines = []
     for part in report["garments"]:
         lines.append(f"{part['file']}:")
@@ -314,7 +314,8 @@ def _text(report: dict[str, Any]) -> str:
         )
         if start["stretch_max"] > _STRETCH_LIMIT or start["depth_max"] > _DEPTH_LIMIT:
             lines.append("  that is far from rest: check that pose, scale and body are those the garment was made for")
-    run = shlex.join(["hood", "rollout", plain_word("garment", report["output"])])
+    words = [plain_word("garment", report["output"]), *([plain_word("body", body)] if body != "default" else [])]
+    run = shlex.join(["hood", "rollout", *words])
     lines.append(f"written to {report['output']}; run it with: {run}")
     return "\n".join(lines)
 

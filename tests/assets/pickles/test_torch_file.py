@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from hood.assets.pickles.torch_file import load_torch
+from hood.assets.pickles.content import load_torch
 from hood.assets.pickles.unpickle import load_pickle
 
 FORMATS = {"zip": True, "stream": False}

@@ -13,8 +13,7 @@ import torch
 from hood import plugins
 from hood.assets.files.guarded import check_size, guarded
 from hood.assets.files.library import SIZE_LIMIT, npy_header, read_arrays
-from hood.assets.pickles.content import load_content, unpickle
-from hood.assets.pickles.torch_file import load_torch
+from hood.assets.pickles.content import load_content, load_torch, unpickle
 
 ARCHIVES, ARRAYS, PICKLES, TENSORS = (".npz",), (".npy",), (".pkl", ".pickle", ".pk", ".p", ".joblib"), (".pt", ".pth")
 MOTION_SUFFIXES = (*ARCHIVES, *PICKLES, *ARRAYS, *TENSORS)
