@@ -48,7 +48,7 @@ COMMANDS = {
 _HOMES = {
     "rollout": "hood.cli.rollout:run",
     "dress": "hood.cli.rollout:dressed",
-    "view": "hood.cli.compare:view",
+    "view": "hood.cli.export:view",
     "compare": "hood.cli.compare:run",
     "export": "hood.cli.export:run",
     "inspect": "hood.cli.inspect.inspect:run",
