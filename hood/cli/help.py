@@ -1,16 +1,23 @@
-"""``hood COMMAND --help``: keys with their defaults, and every name that can be given."""
+"""``hood COMMAND --help``: keys with their defaults, and every name that can be given.
+
+``--cfg`` and ``--info``: the composed config of a command, and what Hydra says about it.
+"""
 
 from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from hood.app.settings.compose import CONFIG_FOLDER, load_config, notes, options, plain, shown
+from hood.app.common import split_words
+from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, notes, options, plain, read_word, shown
+from hood.app.settings.overrides import search_path
+from hood.app.sweep import FLAGS, hydra_itself
 from hood.assets.files import library
+from hood.plugins import config_folders
 
 _EXAMPLES = {
     "sizes": [
@@ -89,6 +96,20 @@ _NAMED = {
     "weights": ("checkpoint", "models", "weights"),
 }
 _ABSENT = object()
+#: Words of all commands, and of some, that are no keys.
+_FLAGS = {
+    "": (
+        "  --cfg job                       print the config of these words and run nothing; --package KEY: a part of it",
+        "  --info                          what Hydra says of it: search path, defaults, plugins; --info defaults-tree: a part",
+    ),
+    "train": (
+        "  -m                              a sweep, one run for each combination: hood train -m seed=0,1,2 model=ours,fine15;",
+        "                                  hydra/launcher=joblib: several at a time; --cfg hydra: its keys, hydra.launcher.*",
+    ),
+}
+#: What of Hydra's configuration, and which of Hydra's reports, can be asked for.
+_CFG, _INFO = ("job", "hydra", "all"), ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+_QUESTIONS = {"--cfg": "--cfg", "-c": "--cfg", "--info": "--info", "-i": "--info", "--package": "--package", "-p": "--package"}
 #: Groups whose keys a command's help lists one by one, those of the chosen option.
 _LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"material": "default", "solver": "newton"}}
 
@@ -99,6 +120,7 @@ def describe(name: str) -> str:
     said, titles = notes(name), _headings(name)
     lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
+    lines += [*_FLAGS.get(name, ()), *_FLAGS[""], ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
@@ -127,6 +149,60 @@ def describe(name: str) -> str:
         lines += _names(config)
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
     return "\n".join(lines)
+
+
+def asks(words: Sequence[str]) -> bool:
+    """Whether the words of a command ask what it would do."""
+    return any(word.partition("=")[0] in _QUESTIONS for word in words)
+
+
+def answer(name: str, words: Sequence[str]) -> int:
+    """Print the config that the words of a command make, or what Hydra says about it; returns the exit code.
+
+    Raises:
+        ConfigError: a question that cannot be answered, or words that the command does not take.
+    """
+    asked, rest = _asked(words)
+    files, hydras = name in _BEFORE_KEYS, [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+    rest = [word for word in rest if word not in hydras and not (name == "train" and word in FLAGS)]
+    given = [] if not files else split_words(name, rest)[0]
+    rest = [word for word in rest if word not in given]
+    config, part = load_config(name, rest), asked.get("--package")
+    if "--info" in asked or asked["--cfg"] != "job":
+        hydra = hydra_itself()
+        ready = [search_path(config_folders()), *hydras, *(read_word(word, load_config(name))[0] for word in rest)]
+        if "--info" in asked:
+            hydra.show_info(asked["--info"], name, ready)
+        else:
+            hydra.show_cfg(name, ready, asked["--cfg"], part)
+        return 0
+    if part not in (None, "_global_"):
+        config = OmegaConf.select(config, str(part), default=_ABSENT)
+        if config is _ABSENT:
+            raise ConfigError(f"--package {part}: no such key; hood {name} --cfg job prints all")
+    print(OmegaConf.to_yaml(config) if isinstance(config, DictConfig | ListConfig) else config, end="")
+    return 0
+
+
+def _asked(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """The questions among the words, and the others."""
+    asked, rest, queue = dict[str, str](), list[str](), list(words)
+    while queue:
+        word = queue.pop(0)
+        flag, _, value = word.partition("=")
+        question = _QUESTIONS.get(flag)
+        if question is None:
+            rest.append(word)
+            continue
+        if not value and queue and (question == "--package" or queue[0] in (*_CFG, *_INFO)):
+            value = queue.pop(0)
+        asked[question] = value or {"--info": "all"}.get(question, "")
+    for question, known in (("--cfg", _CFG), ("--info", _INFO)):
+        if asked.get(question, known[0]) not in known:
+            raise ConfigError(f"{question} {asked[question]}".rstrip() + f": give {', '.join(known[:-1])} or {known[-1]}")
+    if "--package" in asked and ("--cfg" not in asked or not asked["--package"]):
+        raise ConfigError("--package: a key of the config that --cfg job prints, such as --cfg job --package trainer")
+    return asked, rest
 
 
 def _elsewhere(config: DictConfig, groups: list[str]) -> list[str]:

@@ -8,6 +8,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from hood import plugins
@@ -111,7 +112,7 @@ def aloud(sentence: str, error: bool, passing: bool) -> None:
 
 def _run(name: str, overrides: Sequence[str]) -> int:
     try:
-        command = _command(name)
+        command = _command(name, overrides)
         if not gc.isenabled():  # see entry()
             gc.freeze()
             gc.enable()
@@ -166,9 +167,14 @@ def _fail(message: str) -> int:
     return 2
 
 
-def _command(name: str) -> Callable[[Sequence[str]], int]:
+def _command(name: str, words: Sequence[str]) -> Callable[[Sequence[str]], int]:
     from importlib import import_module
 
+    if name in COMMANDS and any(word.startswith("-") for word in words):
+        from hood.cli.help import answer, asks
+
+        if asks(words):
+            return partial(answer, name)
     module, _, function = _HOMES.get(name, "").partition(":")
     run: Callable[[Sequence[str]], int] = getattr(import_module(module), function) if module else plugins.find("commands", name)
     gc.freeze()  # modules stay until the end: looking through them for garbage is 4% of a solver's frame
