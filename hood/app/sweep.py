@@ -27,7 +27,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hood.app.common import output_folder, prepare_folder
+from hood.app.common import GivenUpError, output_folder, prepare_folder
 from hood.app.notices import heard
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, _one_line, load_config, options, read_word
 from hood.app.settings.overrides import parse, quoted, search_path
@@ -36,6 +36,7 @@ from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import install, listening, say, unheard
 from hood.plugins import config_folders
+from hood.training import distributed
 from hood.training.checkpoint import previous
 
 FLAGS = ("-m", "--multirun")
@@ -85,6 +86,8 @@ def sweep(words: Sequence[str]) -> Swept:
         OccupiedError: another sweep writes there.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        if not distributed.is_first():
+            raise GivenUpError
         raise ConfigError("-m: torchrun shares one training; leave it out, hydra/launcher=joblib runs several at a time")
     hydras = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
     fixed, swept, folder = _divided([word for word in words if word not in (*FLAGS, *hydras)])
@@ -208,6 +211,9 @@ def _divided(words: Sequence[str]) -> tuple[list[str], list[str], Path]:
             fixed.append(word)
     # One value of each key stands for all: what is wrong with another costs its run alone.
     for override in swept.values():
+        twice = next((one for one in fixed if one.partition("=")[0] == override.key_or_group), None)
+        if twice is not None:
+            raise ConfigError(f"{twice}: the key has several values in this command; leave one of the two out")
         group, values = override.key_or_group, [str(value) for value in override.sweep_string_iterator()]
         strange = next((value for value in values if (CONFIG_FOLDER / group).is_dir() and value not in options(group)), None)
         if strange is not None:

@@ -27,6 +27,7 @@ _EXAMPLES = {
     "train": [
         "hood train experiment=quickstart output=runs/quickstart",
         "hood train model=ours trainer=paper data.garments=[dress]",
+        "hood train -m seed=0,1,2 model=ours,fine15 output=runs/sweep",
     ],
     "rollout": [
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
@@ -47,6 +48,7 @@ _EXAMPLES = {
         "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
         "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
         "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
+        "hood compare runs/sweep output=runs.csv",
     ],
     "fabric": [
         "hood fabric",
@@ -145,6 +147,8 @@ def describe(name: str) -> str:
         within = notes(f"{group}/{option}")
         lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
     lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
+    if name == "compare":
+        lines += ["", "Folders of trainings are compared as a table of their keys and figures; output=runs.csv writes it."]
     if groups or name in ("dress", "tradeoff", "envelope"):
         lines += _names(config)
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
@@ -163,25 +167,39 @@ def answer(name: str, words: Sequence[str]) -> int:
         ConfigError: a question that cannot be answered, or words that the command does not take.
     """
     asked, rest = _asked(words)
-    files, hydras = name in _BEFORE_KEYS, [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+    hydras = [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
     rest = [word for word in rest if word not in hydras and not (name == "train" and word in FLAGS)]
-    given = [] if not files else split_words(name, rest)[0]
-    rest = [word for word in rest if word not in given]
-    config, part = load_config(name, rest), asked.get("--package")
+    if name in _BEFORE_KEYS:
+        files = split_words(name, rest)[0]
+        rest = [word for word in rest if word not in files]
+    config, part = _composed(name, rest), asked.get("--package")
     if "--info" in asked or asked["--cfg"] != "job":
-        hydra = hydra_itself()
-        ready = [search_path(config_folders()), *hydras, *(read_word(word, load_config(name))[0] for word in rest)]
+        own = load_config(name)
+        given = [read_word(word, own)[0] for word in rest if word.partition("=")[0].split(".")[0] in (*own, *_groups_of(name))]
+        hydra, given = hydra_itself(), [search_path(config_folders()), *hydras, *given]
         if "--info" in asked:
-            hydra.show_info(asked["--info"], name, ready)
+            hydra.show_info(asked["--info"], name, given)
         else:
-            hydra.show_cfg(name, ready, asked["--cfg"], part)
+            hydra.show_cfg(name, given, asked["--cfg"], part)
         return 0
-    if part not in (None, "_global_"):
-        config = OmegaConf.select(config, str(part), default=_ABSENT)
-        if config is _ABSENT:
-            raise ConfigError(f"--package {part}: no such key; hood {name} --cfg job prints all")
-    print(OmegaConf.to_yaml(config) if isinstance(config, DictConfig | ListConfig) else config, end="")
+    value = config if part in (None, "_global_") else OmegaConf.select(config, str(part), default=_ABSENT)
+    if value is _ABSENT:
+        raise ConfigError(f"--package {part}: no such key; hood {name} --cfg job prints all")
+    if not isinstance(value, DictConfig | ListConfig):
+        print(shown(value))
+        return 0
+    print("" if value is config else f"# @package {part}\n", OmegaConf.to_yaml(value), sep="", end="")
     return 0
+
+
+def _composed(name: str, words: Sequence[str]) -> DictConfig:
+    """The config of a command, with that of the command whose keys it takes beside its own."""
+    if name not in ("dress", "plan"):
+        return load_config(name, words)
+    mine = [word for word in words if word.partition("=")[0] in load_config(name) or word.startswith("-")]
+    theirs = [word for word in words if word not in mine]
+    training = name == "plan" and any(word.startswith(("experiment=", "trainer", "data.")) for word in theirs)
+    return OmegaConf.create({**load_config("train" if training else "rollout", theirs), **load_config(name, mine)})
 
 
 def _asked(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:

@@ -65,13 +65,15 @@ _HOMES = {
 EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
-    2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed",
+    2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed, train -m: a run",
     3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; dress: too many are",
     130: "interrupted; what is done is kept",
 }
 
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
+#: Words with dashes of commands that take steps; others ask what a command would do.
+_SWEEP = ("-m", "--multirun")
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
 _SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
 
@@ -215,7 +217,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
     from hood.native import build
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
-    if arguments and arguments[0] in _SIMULATE and not any(word in ("-h", "--help") for word in arguments):
+    if arguments and arguments[0] in _SIMULATE and not any(word[:1] == "-" and word not in _SWEEP for word in arguments):
         build.start()
     try:
         code = main(arguments)
