@@ -11,10 +11,11 @@ import math
 import os
 import re
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hydra import initialize_config_dir
 from hydra._internal.hydra import Hydra
@@ -31,17 +32,17 @@ from hood.app.common import GivenUpError, output_folder, prepare_folder
 from hood.app.notices import heard
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, _one_line, load_config, options, read_word
 from hood.app.settings.overrides import parse, quoted, search_path
-from hood.app.train import Tick, is_finished, last_record, tell_iterations, train
-from hood.assets.files.atomic import occupy, write_atomically
+from hood.app.train import Tick, is_finished, iterations_of, last_record, tell_iterations, train
+from hood.assets.files.atomic import is_occupied, occupy, write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import install, listening, say, unheard
 from hood.plugins import config_folders
 from hood.training import distributed
-from hood.training.checkpoint import previous
+from hood.training.checkpoint import previous, reached
 
 FLAGS = ("-m", "--multirun")
 #: Runs of a sweep go there where no output is given.
-FOLDER = "runs/sweep"
+_FOLDER = "runs/sweep"
 #: In the folder of a run that could not be begun or finished: why.
 REASON = "error.txt"
 #: Launchers that are packages of their own, by the extra that installs them.
@@ -78,7 +79,7 @@ def hydra_itself() -> Hydra:
         return GlobalHydra.instance().hydra
 
 
-def sweep(words: Sequence[str]) -> Swept:
+def run_sweep(words: Sequence[str]) -> Swept:
     """Run the trainings that the words of ``hood train -m`` ask for; those that are finished already are left alone.
 
     Raises:
@@ -131,6 +132,16 @@ def _launched(hydra: Hydra, words: list[str], folder: Path) -> Swept:
         runs = sorted(path.parent for path in folder.rglob(".hydra"))
     failed = {run: (run / REASON).read_text(encoding="utf-8").strip() for run in runs if (run / REASON).exists()}
     return Swept(runs, failed | ({folder: reason} if reason else {}), interrupted)
+
+
+def state_of(run: Path, record: Mapping[str, Any]) -> tuple[int, int | None, str]:
+    """How many iterations the training in a folder has done, how many it is to do by the ``record`` of its settings, and
+    whether it is finished, running, failed (by :data:`REASON`) or stopped."""
+    iteration, written = reached(run)
+    total = iterations_of(record["trainer"]) if "trainer" in record else None
+    if written and total is not None and iteration >= total:
+        return iteration, total, "finished"
+    return iteration, total, "running" if is_occupied(run) else "failed" if (run / REASON).exists() else "stopped"
 
 
 def one_run(_: DictConfig) -> float:
@@ -219,7 +230,7 @@ def _divided(words: Sequence[str]) -> tuple[list[str], list[str], Path]:
         if strange is not None:
             raise ConfigError(unknown(group, strange, options(group)))
         load_config("train", [*fixed, f"{group}={values[0]}", *([output] if output else [])])
-    folder = output_folder(load_config("train", [*fixed, output or f"output={FOLDER}"])).absolute()
+    folder = output_folder(load_config("train", [*fixed, output or f"output={_FOLDER}"])).absolute()
     if (folder / "config.yaml").exists():
         raise ConfigError(f"output={folder}: holds a run of its own; give the sweep another output")
     return [read_word(word, defaults)[0] for word in fixed], [*swept], folder

@@ -21,13 +21,12 @@ from hood.app.common import held_folder, output_folder, require_package, split_w
 from hood.app.output.export import lay_on, read_checked, read_textures
 from hood.app.settings.compose import ConfigError, require_choice, shown
 from hood.app.settings.record import read_record, read_words
-from hood.app.sweep import REASON
-from hood.app.train import iterations_of, last_record
-from hood.assets.files.atomic import is_occupied, write_atomically
+from hood.app.sweep import REASON, state_of
+from hood.app.train import last_record
+from hood.assets.files.atomic import write_atomically
 from hood.assets.formats.image import Texture
 from hood.evaluation.files import fixed_width, write_rows
 from hood.rollouts.file.reader import RolloutData
-from hood.training.checkpoint import reached
 
 _COLOURS = ("strain", "rg", "contact", "fabric")
 #: Written above a rollout where its file holds them: medians over the frames that have a value.
@@ -232,13 +231,7 @@ def _rows(runs: Sequence[Path]) -> tuple[list[dict[str, Any]], list[str], list[s
     differ = [key for key in keys if len({values.get(key, "") for _, values in settings}) > 1]
     names = short_names([run / "rollout.h5" for run in runs])  # the name of a rollout is that of its folder
     for run, name, (record, values) in zip(runs, names, settings, strict=True):
-        iteration, written = reached(run)
-        total = iterations_of(record["trainer"]) if "trainer" in record else None
-        finished = written and total is not None and iteration >= total
-        state = (
-            "finished" if finished else "running" if is_occupied(run) else "failed" if (run / REASON).exists() else "stopped"
-        )
-        figures = last_record(run)
+        (iteration, total, state), figures = state_of(run, record), last_record(run)
         rows.append(
             {
                 "run": name,

@@ -13,7 +13,7 @@ from hood.app.batch.dress import dress_rows
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
-from hood.app.sweep import is_sweep, sweep
+from hood.app.sweep import is_sweep, run_sweep
 from hood.app.train import Tick
 from hood.app.train import train as trained
 from hood.cli.compare import table_of_runs
@@ -55,7 +55,7 @@ def train(overrides: Sequence[str]) -> int:
     0."""
     if not is_sweep(overrides):
         return 130 if trained(overrides, training_bar).interrupted else 0
-    done = sweep(overrides)
+    done = run_sweep(overrides)
     print("\n".join(table_of_runs(done.runs)), flush=True)
     for folder, reason in done.failed.items():
         print(f"hood: {folder.name}: {reason}", file=sys.stderr)
