@@ -49,8 +49,9 @@ REASON = "error.txt"
 _EXTRAS = {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray", "ray_aws": "ray"}
 #: What may stand in the name of a run's folder, and how long it may be.
 _FOREIGN, _LONGEST = re.compile(r"[^\w.,=+@\[\]{}()|:-]"), 160
-#: Process that sweeps. A launcher's other processes have no entry, and end with the one that started them.
+#: The process that sweeps, which goes on without the one that started it (nohup); a launcher's own processes do not.
 _SWEEPING: set[int] = set()
+_STARTED_BY = os.getppid()
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ def is_sweep(words: Sequence[str]) -> bool:
 def hydra_itself() -> Hydra:
     """Hydra with our configs, for what it does beyond composing; :func:`search_path` is a word that it needs."""
     with initialize_config_dir(str(CONFIG_FOLDER), job_name="train", version_base="1.3"):
-        return GlobalHydra.instance().hydra
+        hydra = GlobalHydra.instance().hydra
+    assert hydra is not None
+    return hydra
 
 
 def run_sweep(words: Sequence[str]) -> Swept:
@@ -159,6 +162,8 @@ def one_run(_: DictConfig) -> float:
     def tell(sentence: str, error: bool, passing: bool) -> None:
         log.log(logging.WARNING if error and not passing else logging.INFO, sentence.removeprefix("hood: "))
 
+    if _is_orphan():
+        os._exit(130)
     (folder / REASON).unlink(missing_ok=True)
     with unheard(), listening(tell), heard():
         try:
@@ -167,6 +172,8 @@ def one_run(_: DictConfig) -> float:
             write_atomically(folder / REASON, f"{_one_line(error)}\n".encode())
             log.error(_one_line(error), exc_info=not isinstance(error, (ValueError, OSError, ImportError)))
             return math.nan
+    if _is_orphan():
+        os._exit(130)  # it would begin the next one
     if interrupted:
         raise KeyboardInterrupt
     return float(last_record(folder).get("relative_gradient", math.nan))
@@ -190,15 +197,19 @@ def _trained(words: list[str], folder: Path) -> bool:
 def _ending_with_the_sweep(total: int, done: int) -> Iterator[Tick]:
     """A :data:`hood.app.train.TrainingBar`. A launcher's process whose sweep was killed ends as by SIGTERM, with a checkpoint:
     it would hold the folder against the same command."""
-    parent = None if os.getpid() in _SWEEPING else os.getppid()
     with tell_iterations(total, done) as tell:
 
         def tick(iteration: int, report: dict[str, float] | None) -> None:
             tell(iteration, report)
-            if parent is not None and os.getppid() != parent:
+            if _is_orphan():
                 os.kill(os.getpid(), signal.SIGTERM)
 
         yield tick
+
+
+def _is_orphan() -> bool:
+    """Whether this is a launcher's process, and the sweep that it works for was killed."""
+    return os.getpid() not in _SWEEPING and os.getppid() != _STARTED_BY
 
 
 def _divided(words: Sequence[str]) -> tuple[list[str], list[str], Path]:
