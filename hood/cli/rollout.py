@@ -56,7 +56,7 @@ def train(overrides: Sequence[str]) -> int:
     if not is_sweep(overrides):
         return 130 if trained(overrides, training_bar).interrupted else 0
     done = run_sweep(overrides)
-    print("\n".join(table_of_runs(done.runs)), flush=True)
+    print("\n".join(table_of_runs(done.runs) if done.runs else ["no run has begun"]), flush=True)
     for folder, reason in done.failed.items():
         print(f"hood: {folder.name}: {reason}", file=sys.stderr)
     if done.interrupted:
