@@ -74,12 +74,35 @@ def is_sweep(words: Sequence[str]) -> bool:
     return any(word in FLAGS for word in words)
 
 
-def hydra_itself() -> Hydra:
-    """Hydra with our configs, for what it does beyond composing; :func:`search_path` is a word that it needs."""
+def hydra_of(command: str, words: Sequence[str], info: str | None = None) -> DictConfig:
+    """What Hydra composes for the words of a command, its own configuration under ``hydra``; with ``info``, its report of that
+    name is printed.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    hydra, words = _hydra(), [search_path(config_folders()), *words]
+    with _own_logging(), _in_one_line():
+        if info is not None:
+            hydra.show_info(info, command, words)
+        return hydra.compose_config(command, words, RunMode.RUN)
+
+
+def _hydra() -> Hydra:
+    """Hydra with our configs, for what it does beyond composing."""
     with initialize_config_dir(str(CONFIG_FOLDER), job_name="train", version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
     assert hydra is not None
     return hydra
+
+
+@contextmanager
+def _in_one_line() -> Iterator[None]:
+    """What Hydra cannot do, as a ConfigError."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"configuration: {_one_line(error)}") from error
 
 
 def run_sweep(words: Sequence[str]) -> Swept:
@@ -97,7 +120,7 @@ def run_sweep(words: Sequence[str]) -> Swept:
     fixed, swept, folder = _divided([word for word in words if word not in (*FLAGS, *hydras)])
     if not swept and not any(word.startswith("hydra/sweeper=") or "sweeper.params" in word for word in hydras):
         raise ConfigError("-m: no key has several values; write some, such as seed=0,1,2, or leave -m out")
-    hydra = hydra_itself()
+    hydra = _hydra()
     _require_launcher(hydra, hydras)
     constant = ",".join(quoted(parse(word).get_key_element()) for word in fixed)
     own = [
@@ -108,10 +131,8 @@ def run_sweep(words: Sequence[str]) -> Swept:
         f"hydra.job.config.override_dirname.exclude_keys=[{constant}]",
     ]
     words = [*own, *hydras, *fixed, *swept]
-    try:
+    with _in_one_line():
         hydra.compose_config("train", words, RunMode.MULTIRUN)  # before a folder is made
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"configuration: {_one_line(error)}") from error
     with occupy(prepare_folder(folder)), _own_logging():
         return _launched(hydra, words, folder)
 
@@ -120,11 +141,10 @@ def _launched(hydra: Hydra, words: list[str], folder: Path) -> Swept:
     interrupted, reason, jobs = False, "", None
     _SWEEPING.add(os.getpid())
     try:
-        jobs = hydra.multirun("train", one_run, words)
+        with _in_one_line():
+            jobs = hydra.multirun("train", one_run, words)
     except KeyboardInterrupt:
         interrupted = True
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"configuration: {_one_line(error)}") from error
     except RuntimeError as error:  # of a launcher, as where the system killed a process of it
         reason = f"the launcher gave up ({_one_line(error)}); the same command again goes on"
     finally:
@@ -141,7 +161,8 @@ def state_of(run: Path, record: Mapping[str, Any]) -> tuple[int, int | None, str
     """How many iterations the training in a folder has done, how many it is to do by the ``record`` of its settings, and
     whether it is finished, running, failed (by :data:`REASON`) or stopped."""
     iteration, written = reached(run)
-    total = iterations_of(record["trainer"]) if "trainer" in record else None
+    trainer = record.get("trainer")
+    total = iterations_of(trainer) if isinstance(trainer, Mapping) and "iterations" in trainer else None
     if written and total is not None and iteration >= total:
         return iteration, total, "finished"
     return iteration, total, "running" if is_occupied(run) else "failed" if (run / REASON).exists() else "stopped"
@@ -231,7 +252,7 @@ def _divided(words: Sequence[str]) -> tuple[list[str], list[str], Path]:
             swept[word] = override
         else:
             fixed.append(word)
-    # One value of each key stands for all: what is wrong with another costs its run alone.
+    first = []
     for override in swept.values():
         twice = next((one for one in fixed if one.partition("=")[0] == override.key_or_group), None)
         if twice is not None:
@@ -240,8 +261,9 @@ def _divided(words: Sequence[str]) -> tuple[list[str], list[str], Path]:
         strange = next((value for value in values if (CONFIG_FOLDER / group).is_dir() and value not in options(group)), None)
         if strange is not None:
             raise ConfigError(unknown(group, strange, options(group)))
-        load_config("train", [*fixed, f"{group}={values[0]}", *([output] if output else [])])
-    folder = output_folder(load_config("train", [*fixed, output or f"output={_FOLDER}"])).absolute()
+        first.append(f"{group}={values[0]}")
+    # One value of each key stands for all: what is wrong with another costs its run alone.
+    folder = output_folder(load_config("train", [*fixed, *first, output or f"output={_FOLDER}"])).absolute()
     if (folder / "config.yaml").exists():
         raise ConfigError(f"output={folder}: holds a run of its own; give the sweep another output")
     return [read_word(word, defaults)[0] for word in fixed], [*swept], folder
@@ -259,7 +281,7 @@ def _several(word: str) -> Override | None:
 def _require_launcher(hydra: Hydra, words: Sequence[str]) -> None:
     """Raise ConfigError where a launcher is asked for that is not there."""
     name = next((word.partition("=")[2] for word in reversed(words) if word.startswith("hydra/launcher=")), "basic")
-    there = hydra.config_loader.get_group_options("hydra/launcher", ObjectType.CONFIG)
+    there = [*hydra.config_loader.get_group_options("hydra/launcher", ObjectType.CONFIG), *options("hydra/launcher")]
     if name in there:
         return
     if name in _EXTRAS:

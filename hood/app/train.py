@@ -298,7 +298,7 @@ def last_record(folder: Path) -> dict[str, float]:
     the last of its processes; empty where there is none. A line cut by a kill is passed over."""
     path = folder / "metrics.jsonl"
     figures: dict[str, float] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
         try:
             read = {str(name): math.nan if value is None else float(value) for name, value in json.loads(line).items()}
         except (ValueError, TypeError, AttributeError):

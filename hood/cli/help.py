@@ -14,10 +14,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hood.app.common import split_words
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, notes, options, plain, read_word, shown
-from hood.app.settings.overrides import search_path
-from hood.app.sweep import FLAGS, hydra_itself
+from hood.app.sweep import FLAGS, hydra_of
 from hood.assets.files import library
-from hood.plugins import config_folders
 
 _EXAMPLES = {
     "sizes": [
@@ -120,7 +118,7 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     said, titles = notes(name), _headings(name)
-    lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {'[-m] ' if name == 'train' else _BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
     lines += [*_FLAGS.get(name, ()), *_FLAGS[""], ""]
     for key in config:
@@ -176,15 +174,13 @@ def answer(name: str, words: Sequence[str]) -> int:
     if "--info" in asked or asked["--cfg"] != "job":
         own = load_config(name)
         given = [read_word(word, own)[0] for word in rest if word.partition("=")[0].split(".")[0] in (*own, *_groups_of(name))]
-        hydra, given = hydra_itself(), [search_path(config_folders()), *hydras, *given]
+        config = hydra_of(name, [*hydras, *given], asked.get("--info"))
         if "--info" in asked:
-            hydra.show_info(asked["--info"], name, given)
-        else:
-            hydra.show_cfg(name, given, asked["--cfg"], part)
-        return 0
+            return 0
+        config = config if asked["--cfg"] == "all" else OmegaConf.create({"hydra": config.hydra})
     value = config if part in (None, "_global_") else OmegaConf.select(config, str(part), default=_ABSENT)
     if value is _ABSENT:
-        raise ConfigError(f"--package {part}: no such key; hood {name} --cfg job prints all")
+        raise ConfigError(f"--package {part}: no such key; hood {name} --cfg {asked['--cfg']} prints all")
     if not isinstance(value, DictConfig | ListConfig):
         print(shown(value))
         return 0

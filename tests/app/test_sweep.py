@@ -158,6 +158,7 @@ def test_runs_of_no_sweep_differ_by_their_records(swept: Path, capsys: pytest.Ca
         (["-m", "sed=0,1"], "did you mean 'seed'"),
         (["-m", "seed=0,1", "trainer.iteration=3"], "did you mean 'trainer.iterations'"),
         (["-m", "model=ours,fin15"], "did you mean 'fine15'"),
+        (["-m", "seed=0,1", "trainer=paper,long", "trainer.schedule.ever=1,2"], "did you mean 'trainer.schedule.every'"),
         (["-m", "seed=0,1", "seed=3"], "seed=3: the key has several values"),
         (["-m", "seed=0,1", "resume=false"], "a sweep goes on with what is not finished"),
         (["-m", "seed=0,1", "hydra/launcher=ray_aws"], 'pip install "hood-cloth[ray]"'),
@@ -201,7 +202,17 @@ def test_the_composed_config_is_printed(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out == "99\n"
     assert main(["train", "--cfg", "hydra", "-p", "hydra.launcher", "hydra/launcher=joblib"]) == 0
     assert "n_jobs: -1" in capsys.readouterr().out
-    for words in (["--cfg"], ["--cfg", "jobs"], ["--info", "x=1"], ["--package", "seed"], ["--cfg", "job", "-p", "sed"]):
+    assert main(["train", "--cfg", "all", "-p", "hydra.sweeper.max_batch_size"]) == 0
+    assert capsys.readouterr().out == "null\n"
+    for words in (
+        ["--cfg", "hydra", "hydra.x=1"],
+        ["--cfg", "hydra", "-p", "seed"],
+        ["--cfg"],
+        ["--cfg", "jobs"],
+        ["--info", "x=1"],
+        ["--package", "seed"],
+        ["--cfg", "job", "-p", "sed"],
+    ):
         assert main(["train", *words]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
