@@ -145,7 +145,11 @@ def _launched(hydra: Hydra, words: list[str], folder: Path) -> Swept:
             jobs = hydra.multirun("train", one_run, words)
     except KeyboardInterrupt:
         interrupted = True
-    except RuntimeError as error:  # of a launcher, as where the system killed a process of it
+    except ConfigError:
+        raise
+    except Exception as error:  # of a launcher, as where the system killed a process of it
+        if os.environ.get("HOOD_TRACEBACK"):
+            raise
         reason = f"the launcher gave up ({_one_line(error)}); the same command again goes on"
     finally:
         _SWEEPING.discard(os.getpid())

@@ -118,6 +118,15 @@ def test_joblib_trains_several_at_a_time(
     assert weights(Path("beside")) == weights(swept)
 
 
+def test_a_launcher_that_gives_up_is_told_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=0", "output=none"]
+    assert main(["train", "-m", "seed=0,1", *TINY, *words]) == 2
+    told = capsys.readouterr()
+    assert told.out.endswith("no run has begun\n")
+    assert told.err.startswith("hood: none: the launcher gave up (n_jobs == 0")
+    assert told.err.count("\n") == 1
+
+
 def test_the_table_on_demand(swept: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(swept), "output=tables/runs.csv"]) == 0
     head, *rows, _ = capsys.readouterr().out.splitlines()
