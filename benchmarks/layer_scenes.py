@@ -29,7 +29,7 @@ from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.media.pieces import outfit_colours
-from hood.media.renderer.camera import Camera
+from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import BODY_COLOR, Picture, RenderMesh, contact_sheet, render_frame
 from hood.media.video import save_png
 from hood.mesh.penetration.crossing import self_crossings

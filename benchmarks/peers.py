@@ -63,7 +63,7 @@ from hood.app.candidates import machine_name
 from hood.assets.files.library import locate
 from hood.energies.potential import Potential
 from hood.energies.self_contact import for_networks
-from hood.media.renderer.camera import Camera
+from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import BODY_COLOR, RenderMesh, captioned, render_frame
 from hood.media.video import save_png
 from hood.model.network.kernel_choice import choose_kernels

@@ -68,7 +68,7 @@ def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], Dict
     Raises:
         ConfigError: a word begins like an option, or a key or value is unknown.
     """
-    overrides = [word for word in arguments if "=" in word and not Path(word).exists()]
+    overrides = [word for word in arguments if ("=" in word and not Path(word).exists()) or word in ("-m", "--multirun")]
     given = [word for word in arguments if word not in overrides]
     strange = next((word for word in given if word.startswith("-")), None)
     if strange is not None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -47,7 +49,8 @@ from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES
 from hood.training import distributed
 from hood.training.callbacks import Callback, ValidationWatch
-from hood.training.checkpoint import previous
+from hood.training.checkpoint import previous, reached
+from hood.training.curriculum import scaled_count
 from hood.training.log import LOGGERS, Logger
 from hood.training.optimiser import dotted_name, made
 from hood.training.scenes import SceneSampler
@@ -344,6 +347,39 @@ def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential,
         device=str(config.device),
     )
     return ValidationWatch(validation, folder)
+
+
+def is_finished(config: DictConfig, folder: Path) -> bool:
+    """Whether the run in a folder has all iterations that the config asks for, and wrote its weights.
+
+    Raises:
+        ConfigError: the run there has other settings.
+    """
+    iteration, written = reached(folder)
+    if iteration:
+        require_same_config(config, folder, _FREE, _BOOKKEEPING)
+    return written and iteration >= iterations_of(plain(config.trainer))
+
+
+def iterations_of(trainer: Mapping[str, Any]) -> int:
+    """Updates in all that the settings of a trainer say."""
+    return scaled_count("trainer.iterations", int(trainer["iterations"]), float(trainer.get("time_scale", 1.0)))
+
+
+def last_record(folder: Path) -> dict[str, float]:
+    """The latest of every figure in the ``metrics.jsonl`` of a run, and the ``seconds`` that its updates took, at the rate of
+    the last of its processes; empty where there is none. A line cut by a kill is passed over."""
+    path = folder / "metrics.jsonl"
+    figures: dict[str, float] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
+        try:
+            read = {str(name): math.nan if value is None else float(value) for name, value in json.loads(line).items()}
+        except (ValueError, TypeError, AttributeError):
+            continue
+        if read.get("iterations_per_second", 0.0) > 0:
+            read["seconds"] = read.get("iteration", math.nan) / read["iterations_per_second"]
+        figures |= read
+    return figures
 
 
 def _is_resumed(config: DictConfig, folder: Path, checkpoint: Path) -> bool:

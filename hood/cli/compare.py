@@ -1,6 +1,6 @@
 """``hood compare A.h5 B.h5``: rollouts of one motion next to each other, as a video and a contact sheet.
 
-``hood view rollout.h5 …``: rollouts as one HTML page that turns and plays in a browser, without a network.
+``hood compare runs/*``: trainings, as a table.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,15 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.app.common import frame_count, held_folder, output_folder, require_package, split_words, thinning
+from hood.app.common import held_folder, output_folder, require_package, split_words, thinning
 from hood.app.output.export import lay_on, read_checked, read_textures
-from hood.app.settings.compose import ConfigError, require_choice
+from hood.app.settings.compose import ConfigError, require_choice, shown
+from hood.app.settings.record import read_record, read_words
+from hood.app.sweep import REASON, state_of
+from hood.app.train import last_record
 from hood.assets.files.atomic import write_atomically
 from hood.assets.formats.image import Texture
+from hood.evaluation.files import fixed_width, write_rows
 from hood.rollouts.file.reader import RolloutData
 
 _COLOURS = ("strain", "rg", "contact", "fabric")
@@ -47,6 +51,11 @@ class _Entry:
 def run(arguments: Sequence[str]) -> int:
     """Run the command ``compare``; returns the exit code."""
     files, config = _split(arguments)
+    runs = _runs_among(files)
+    if runs:
+        return _compare_runs(runs, [word for word in arguments if "=" in word and not Path(word).exists()], config)
+    if len(files) < 2:
+        raise ConfigError(f"number of rollouts given: {len(files)}; give two or more, hood compare A.h5 B.h5")
     require_choice(config, "colour", _COLOURS)
     require_choice(config, "video", ("mp4", "gif", "none"))
     for key, least in (("num_frames", 1), ("video_stride", 1), ("seed", 0), ("height", 64)):
@@ -76,8 +85,6 @@ def _split(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
     """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
     given, config = split_words("compare", arguments)
     files = [str(config[key]) for key in ("a", "b") if config[key] is not None] + given
-    if len(files) < 2:
-        raise ConfigError(f"number of rollouts given: {len(files)}; give two or more, hood compare A.h5 B.h5")
     return [Path(name).expanduser() for name in files], config
 
 
@@ -158,50 +165,97 @@ def _letter(index: int) -> str:
     return chr(ord("A") + index) if index < 26 else str(index + 1)
 
 
-#: More would be too narrow to see anything.
-_MOST = 4
-#: A page beyond this [bytes] is slow to send and to open.
-_HEAVY = 12_000_000
+#: What a folder of a training holds, at least one of them.
+_OF_RUNS = ("checkpoint.pt", "checkpoint.previous.pt", "metrics.jsonl", REASON, ".hydra")
+#: Figures of a training, by the titles of their columns.
+_FIGURES = {
+    "loss": "loss",
+    "rg": "relative_gradient",
+    "γ": "validation_gap",
+    "strain": "validation_strain_p99",
+    "seconds": "seconds",
+}
+#: Columns of keys that the table has at most; the files have all.
+_KEYS = 6
 
 
-def view(arguments: Sequence[str]) -> int:
-    """Run the command ``view``; returns the exit code."""
-    files, config = _split_view(arguments)
-    count = frame_count(config)
-    target = output_folder(config)
-    if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
-        raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
-    textures = read_textures(config)
-    rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
-    from hood.media.viewer.page import view_page
+def table_of_runs(runs: Sequence[Path]) -> list[str]:
+    """The table of trainings for a terminal: the keys in which they differ, how far they are, what was measured last."""
+    rows, columns, further = _rows(runs)
+    lines = fixed_width(rows, columns).splitlines()
+    return [*lines, f"they differ in {', '.join(further)} as well"] if further else lines
 
-    names = short_names(files)
-    title = " and ".join(names) if config.title is None else str(config.title)
-    page = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts)).encode()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, page)
-    frames = max(len(data.time) for data in rollouts)
-    print(f"{target}: {len(page) / 1e6:.1f} MB, {frames} frames; open it in a browser")
-    if len(page) > _HEAVY and frames > 1:
-        most = max(max(data.cloth_pos.shape[1], data.body_pos.shape[1]) for data in rollouts)
-        fewer = max(int(frames * _HEAVY / len(page)), 1)
-        print(f"that is a heavy page, of up to {most:,} vertices a mesh: num_frames={fewer} keeps it below {_HEAVY / 1e6:g} MB")
+
+def _compare_runs(runs: Sequence[Path], words: Sequence[str], config: DictConfig) -> int:
+    strange = next((word for word in words if word.partition("=")[0] not in ("a", "b", "output")), None)
+    if strange is not None:
+        raise ConfigError(f"{strange}: is about rollouts, and {runs[0]} is a training; leave it out")
+    target = output_folder(config) if any(word.startswith("output=") for word in words) else None
+    if target is not None and target.suffix != ".csv":
+        raise ConfigError(f"output={target}: the table of trainings is one file; name it, such as output=runs.csv")
+    print("\n".join(table_of_runs(runs)))
+    if target is not None:
+        rows, columns, further = _rows(runs)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        written = write_rows(rows, [*columns, *further], target.parent, target.stem)
+        print(f"written: {', '.join(map(str, written))}")
     return 0
 
 
-def _split_view(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
-    """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
-    given, config = split_words("view", arguments)
-    if not 1 <= len(given) <= _MOST:
-        raise ConfigError(f"number of rollouts given: {len(given)}; give one to {_MOST}, hood view rollout.h5")
-    paths = [Path(name).expanduser() for name in given]
-    return [path / "rollout.h5" if path.is_dir() else path for path in paths], config
+def _runs_among(paths: Sequence[Path]) -> list[Path]:
+    """Folders of trainings; a folder that holds some, as that of a sweep, stands for them.
+
+    Raises:
+        ConfigError: some are trainings and others are not.
+    """
+    runs, others = list[Path](), list[Path]()
+    for path in paths:
+        inside = [] if _is_run(path) or not path.is_dir() else sorted(filter(_is_run, path.iterdir()))
+        runs += [path] if _is_run(path) else inside
+        others += [] if _is_run(path) or inside or path.name == "multirun.yaml" else [path]  # which Hydra writes beside them
+    if runs and others:
+        raise ConfigError(f"{others[0]}: is no training, and {runs[0]} is one; compare trainings or rollouts, not both")
+    return runs
 
 
-def _first_frames(data: RolloutData, count: int | None) -> RolloutData:
-    if count is None:
-        return data
-    metrics = {name: values[:count] for name, values in data.metrics.items()}
-    return replace(
-        data, cloth_pos=data.cloth_pos[:count], body_pos=data.body_pos[:count], time=data.time[:count], metrics=metrics
-    )
+def _is_run(path: Path) -> bool:
+    return not (path / "rollout.h5").exists() and any((path / name).exists() for name in _OF_RUNS)
+
+
+def _rows(runs: Sequence[Path]) -> tuple[list[dict[str, Any]], list[str], list[str]]:
+    """A row for every training, the columns of the table, and the keys in which they differ for which it has no room."""
+    settings, rows = [_settings(run) for run in runs], list[dict[str, Any]]()
+    if not all(words for _, words in settings):
+        settings = [(record, dict(_leaves(record))) for record, _ in settings]
+    keys = dict.fromkeys(key for _, values in settings for key in values if key not in ("output", "resume"))
+    differ = [key for key in keys if len({values.get(key, "") for _, values in settings}) > 1]
+    names = short_names([run / "rollout.h5" for run in runs])  # the name of a rollout is that of its folder
+    for run, name, (record, values) in zip(runs, names, settings, strict=True):
+        (iteration, total, state), figures = state_of(run, record), last_record(run)
+        rows.append(
+            {
+                "run": name,
+                **{key: values.get(key) for key in differ},
+                "iteration": iteration,
+                "of": total,
+                **{title: figures.get(figure) for title, figure in _FIGURES.items()},
+                "state": state,
+            }
+        )
+    measured = [title for title in _FIGURES if any(row[title] is not None for row in rows)]
+    return rows, ["run", *differ[:_KEYS], "iteration", "of", *measured, "state"], differ[_KEYS:]
+
+
+def _settings(run: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """The record of a run, and its words where a sweep began it; each empty where there is none."""
+    record, words = run / "config.yaml", run / ".hydra" / "overrides.yaml"
+    return (read_record(record) if record.exists() else {}), (read_words(words) if words.exists() else {})
+
+
+def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Keys and values of a record, ``a.b`` for a key in another."""
+    if isinstance(node, dict):
+        for name, item in node.items():
+            yield from _leaves(item, f"{key}.{name}" if key else str(name))
+    else:
+        yield key, shown(node)

@@ -1,15 +1,20 @@
-"""``hood COMMAND --help``: keys with their defaults, and every name that can be given."""
+"""``hood COMMAND --help``: keys with their defaults, and every name that can be given.
+
+``--cfg`` and ``--info``: the composed config of a command, and what Hydra says about it.
+"""
 
 from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from hood.app.settings.compose import CONFIG_FOLDER, load_config, notes, options, plain, shown
+from hood.app.common import split_words
+from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, notes, options, plain, read_word, shown
+from hood.app.sweep import FLAGS, hydra_of
 from hood.assets.files import library
 
 _EXAMPLES = {
@@ -20,6 +25,7 @@ _EXAMPLES = {
     "train": [
         "hood train experiment=quickstart output=runs/quickstart",
         "hood train model=ours trainer=paper data.garments=[dress]",
+        "hood train -m seed=0,1,2 model=ours,fine15 output=runs/sweep",
     ],
     "rollout": [
         "hood rollout garment=dress sequence=walk_steady num_frames=200 output=outputs/dress",
@@ -40,6 +46,7 @@ _EXAMPLES = {
         "hood compare outputs/network/rollout.h5 outputs/solver/rollout.h5",
         "hood compare a=outputs/plain b=outputs/refined colour=rg output=outputs/compare",
         "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
+        "hood compare runs/sweep output=runs.csv",
     ],
     "fabric": [
         "hood fabric",
@@ -93,6 +100,20 @@ _NAMED = {
     "weights": ("checkpoint", "models", "weights"),
 }
 _ABSENT = object()
+#: Words of all commands, and of some, that are no keys.
+_FLAGS = {
+    "": (
+        "  --cfg job                       print the config of these words and run nothing; --package KEY: a part of it",
+        "  --info                          what Hydra says of it: search path, defaults, plugins; --info defaults-tree: a part",
+    ),
+    "train": (
+        "  -m                              a sweep, one run for each combination: hood train -m seed=0,1,2 model=ours,fine15;",
+        "                                  hydra/launcher=joblib: several at a time; --cfg hydra: its keys, hydra.launcher.*",
+    ),
+}
+#: What of Hydra's configuration, and which of Hydra's reports, can be asked for.
+_CFG, _INFO = ("job", "hydra", "all"), ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+_QUESTIONS = {"--cfg": "--cfg", "-c": "--cfg", "--info": "--info", "-i": "--info", "--package": "--package", "-p": "--package"}
 #: Groups whose keys a command's help lists one by one, those of the chosen option.
 _LISTED = {"train": {"data": "default", "trainer": "fast"}, "rollout": {"material": "default", "solver": "newton"}}
 
@@ -101,8 +122,9 @@ def describe(name: str) -> str:
     """Help text of the command ``name``."""
     config = load_config(name)
     said, titles = notes(name), _headings(name)
-    lines = [f"usage: hood {name} {_BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
+    lines = [f"usage: hood {name} {'[-m] ' if name == 'train' else _BEFORE_KEYS.get(name, '')}[key=value ...]", ""]
     lines += ["In a shell, put words with brackets or braces in quotes: 'key=[1,2]'.", ""]
+    lines += [*_FLAGS.get(name, ()), *_FLAGS[""], ""]
     for key in config:
         value = plain(config[key])
         if isinstance(value, dict):
@@ -127,10 +149,78 @@ def describe(name: str) -> str:
         within = notes(f"{group}/{option}")
         lines += [_row(f"{group}.{key}", value, within.get(key, "")) for key, value in _leaves(plain(config[group]))]
     lines += _elsewhere(config, [group for group in groups if group not in _LISTED.get(name, {})])
+    if name == "compare":
+        lines += ["", "Folders of trainings are compared as a table of their keys and figures; output=runs.csv writes it."]
     if groups or name in ("dress", "tradeoff", "envelope"):
         lines += _names(config)
     lines += ["", "examples:", *(f"  {example}" for example in _EXAMPLES[name])]
     return "\n".join(lines)
+
+
+def asks(words: Sequence[str]) -> bool:
+    """Whether the words of a command ask what it would do."""
+    return any(word.partition("=")[0] in _QUESTIONS for word in words)
+
+
+def answer(name: str, words: Sequence[str]) -> int:
+    """Print the config that the words of a command make, or what Hydra says about it; returns the exit code.
+
+    Raises:
+        ConfigError: a question that cannot be answered, or words that the command does not take.
+    """
+    asked, rest = _asked(words)
+    hydras = [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
+    rest = [word for word in rest if word not in hydras and not (name == "train" and word in FLAGS)]
+    if name in _BEFORE_KEYS:
+        files = split_words(name, rest)[0]
+        rest = [word for word in rest if word not in files]
+    config, part = _composed(name, rest), asked.get("--package")
+    if "--info" in asked or asked["--cfg"] != "job":
+        own = load_config(name)
+        given = [read_word(word, own)[0] for word in rest if word.partition("=")[0].split(".")[0] in (*own, *_groups_of(name))]
+        config = hydra_of(name, [*hydras, *given], asked.get("--info"))
+        if "--info" in asked:
+            return 0
+        config = config if asked["--cfg"] == "all" else OmegaConf.create({"hydra": config.hydra})
+    value = config if part in (None, "_global_") else OmegaConf.select(config, str(part), default=_ABSENT)
+    if value is _ABSENT:
+        raise ConfigError(f"--package {part}: no such key; hood {name} --cfg {asked['--cfg']} prints all")
+    if not isinstance(value, DictConfig | ListConfig):
+        print(shown(value))
+        return 0
+    print("" if value is config else f"# @package {part}\n", OmegaConf.to_yaml(value), sep="", end="")
+    return 0
+
+
+def _composed(name: str, words: Sequence[str]) -> DictConfig:
+    """The config of a command, with that of the command whose keys it takes beside its own."""
+    if name not in ("dress", "plan"):
+        return load_config(name, words)
+    mine = [word for word in words if word.partition("=")[0] in load_config(name) or word.startswith("-")]
+    theirs = [word for word in words if word not in mine]
+    training = name == "plan" and any(word.startswith(("experiment=", "trainer", "data.")) for word in theirs)
+    return OmegaConf.create({**load_config("train" if training else "rollout", theirs), **load_config(name, mine)})
+
+
+def _asked(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """The questions among the words, and the others."""
+    asked, rest, queue = dict[str, str](), list[str](), list(words)
+    while queue:
+        word = queue.pop(0)
+        flag, _, value = word.partition("=")
+        question = _QUESTIONS.get(flag)
+        if question is None:
+            rest.append(word)
+            continue
+        if not value and queue and (question == "--package" or queue[0] in (*_CFG, *_INFO)):
+            value = queue.pop(0)
+        asked[question] = value or {"--info": "all"}.get(question, "")
+    for question, known in (("--cfg", _CFG), ("--info", _INFO)):
+        if asked.get(question, known[0]) not in known:
+            raise ConfigError(f"{question} {asked[question]}".rstrip() + f": give {', '.join(known[:-1])} or {known[-1]}")
+    if "--package" in asked and ("--cfg" not in asked or not asked["--package"]):
+        raise ConfigError("--package: a key of the config that --cfg job prints, such as --cfg job --package trainer")
+    return asked, rest
 
 
 def _elsewhere(config: DictConfig, groups: list[str]) -> list[str]:

@@ -8,6 +8,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from hood import plugins
@@ -48,7 +49,7 @@ COMMANDS = {
 _HOMES = {
     "rollout": "hood.cli.rollout:run",
     "dress": "hood.cli.rollout:dressed",
-    "view": "hood.cli.compare:view",
+    "view": "hood.cli.export:view",
     "compare": "hood.cli.compare:run",
     "export": "hood.cli.export:run",
     "inspect": "hood.cli.inspect.inspect:run",
@@ -64,13 +65,15 @@ _HOMES = {
 EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
-    2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed",
+    2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed, train -m: a run",
     3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; dress: too many are",
     130: "interrupted; what is done is kept",
 }
 
 _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garment, fewer frames or a smaller model"
 
+#: Words with dashes of commands that take steps; others ask what a command would do.
+_SWEEP = ("-m", "--multirun")
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
 _SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
 
@@ -111,7 +114,7 @@ def aloud(sentence: str, error: bool, passing: bool) -> None:
 
 def _run(name: str, overrides: Sequence[str]) -> int:
     try:
-        command = _command(name)
+        command = _command(name, overrides)
         if not gc.isenabled():  # see entry()
             gc.freeze()
             gc.enable()
@@ -166,9 +169,14 @@ def _fail(message: str) -> int:
     return 2
 
 
-def _command(name: str) -> Callable[[Sequence[str]], int]:
+def _command(name: str, words: Sequence[str]) -> Callable[[Sequence[str]], int]:
     from importlib import import_module
 
+    if name in COMMANDS and any(word.startswith("-") for word in words):
+        from hood.cli.help import answer, asks
+
+        if asks(words):
+            return partial(answer, name)
     module, _, function = _HOMES.get(name, "").partition(":")
     run: Callable[[Sequence[str]], int] = getattr(import_module(module), function) if module else plugins.find("commands", name)
     gc.freeze()  # modules stay until the end: looking through them for garbage is 4% of a solver's frame
@@ -209,7 +217,7 @@ def entry(argv: Sequence[str] | None = None) -> None:
     from hood.native import build
 
     build.announce = lambda sentence: print(f"hood: {sentence}", file=sys.stderr)
-    if arguments and arguments[0] in _SIMULATE and not any(word in ("-h", "--help") for word in arguments):
+    if arguments and arguments[0] in _SIMULATE and not any(word[:1] == "-" and word not in _SWEEP for word in arguments):
         build.start()
     try:
         code = main(arguments)

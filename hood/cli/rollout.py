@@ -13,8 +13,10 @@ from hood.app.batch.dress import dress_rows
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
+from hood.app.sweep import is_sweep, run_sweep
 from hood.app.train import Tick
 from hood.app.train import train as trained
+from hood.cli.compare import table_of_runs
 from hood.training import distributed
 
 
@@ -49,8 +51,17 @@ def dressed(overrides: Sequence[str]) -> int:
 
 
 def train(overrides: Sequence[str]) -> int:
-    """Run the command; returns the exit code: 130 where the user interrupted it, else 0."""
-    return 130 if trained(overrides, training_bar).interrupted else 0
+    """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a run of a sweep failed, else
+    0."""
+    if not is_sweep(overrides):
+        return 130 if trained(overrides, training_bar).interrupted else 0
+    done = run_sweep(overrides)
+    print("\n".join(table_of_runs(done.runs) if done.runs else ["no run has begun"]), flush=True)
+    for folder, reason in done.failed.items():
+        print(f"hood: {folder.name}: {reason}", file=sys.stderr)
+    if done.interrupted:
+        print("hood: interrupted; the same command again goes on", file=sys.stderr)
+    return 130 if done.interrupted else 2 if done.failed else 0
 
 
 @contextmanager

@@ -41,11 +41,11 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as fixed-width tables: cost and accuracy, energies, state of the cloth; all in one would be wider than a
     screen."""
     others = _others(rows)
-    energies = [_fixed_width(rows, (*_NAMES, *_TERMS, *others))]
+    energies = [fixed_width(rows, (*_NAMES, *_TERMS, *others))]
     if energies[0].index("\n") > _WIDTH:
-        energies = [_fixed_width(rows, (*_NAMES, *some)) for some in (_TERMS, others)]
+        energies = [fixed_width(rows, (*_NAMES, *some)) for some in (_TERMS, others)]
     first, last = (*_NAMES, *_MAIN, *_GAP, "sound"), (*_NAMES, "worn", "failed", *_STATE, *_SURFACE)
-    return "\n\n".join((_fixed_width(rows, first), *energies, _fixed_width(rows, last)))
+    return "\n\n".join((fixed_width(rows, first), *energies, fixed_width(rows, last)))
 
 
 def describe_rows(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -85,7 +85,8 @@ def _others(rows: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     return tuple(f"L_{name}" for name in other_terms(rows))
 
 
-def _fixed_width(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+def fixed_width(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    """One table of these columns, with a dash where a row lacks one."""
     cells = [[_cell(row.get(column)) for column in columns] for row in rows]
     widths = [max(len(title), *(len(line[i]) for line in cells)) for i, title in enumerate(columns)]
     lines = ["  ".join(title.rjust(width) for title, width in zip(columns, widths, strict=True))]

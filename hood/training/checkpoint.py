@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
+from hood.steppers.checkpoint import read_header
 from hood.training.settings import TrainerSettings
 
 #: What a run cannot go on without.
@@ -100,6 +101,23 @@ def load_last_good(path: Path) -> tuple[dict[str, Any], str | None]:
         except ValueError as second:
             raise ValueError(f"{reason}; and {second}") from error
         return state, f"{reason}; going on from {older.name}, iteration {state['iteration']}"
+
+
+def reached(folder: Path) -> tuple[int, bool]:
+    """How many iterations the run in ``folder`` would go on from, 0 where it has no checkpoint, and whether its
+    ``model.safetensors`` is of that iteration; no tensor is read."""
+    path = folder / "checkpoint.pt"
+    for file in (path, previous(path)):
+        try:
+            state = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+            iteration, behind = int(state["iteration"]), int(state["iteration"]) + int(state["earlier"])
+        except Exception:  # missing, cut or no checkpoint; resuming says which
+            continue
+        try:
+            return iteration, int(read_header(folder / "model.safetensors")["iteration"]) == behind
+        except (OSError, ValueError, KeyError):
+            return iteration, False
+    return 0, False
 
 
 def refuse_other(

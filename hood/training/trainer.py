@@ -326,7 +326,8 @@ class Trainer:
             set_aside(path)
         refuse_other(path, state, self.simulator.config, self.seed, self.settings, self.slots.num_slots)
         self._restore(state)
-        self._saved_at = self.iteration if note is None else -1
+        # A finished run is saved again: it may have been killed between its checkpoint and its weights.
+        self._saved_at = self.iteration if note is None and self.iteration < self.settings.iterations else -1
         self.slots.load_state_dict(state["slots"])
         self.best = float(state["best"])
         self.earlier = int(state["earlier"])

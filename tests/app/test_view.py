@@ -108,7 +108,7 @@ def test_a_heavy_page_says_how_to_lighten_it(monkeypatch: pytest.MonkeyPatch, ca
     record("run/rollout.h5")
     assert main(["view", "run", "output=page.html"]) == 0
     assert capsys.readouterr().out.count("\n") == 1
-    monkeypatch.setattr("hood.cli.compare._HEAVY", Path("page.html").stat().st_size - 1)
+    monkeypatch.setattr("hood.cli.export._HEAVY", Path("page.html").stat().st_size - 1)
     assert main(["view", "run", "output=page.html"]) == 0
     assert "of up to 42 vertices a mesh: num_frames=3 keeps it below" in capsys.readouterr().out
 

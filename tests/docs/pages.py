@@ -76,3 +76,9 @@ def words_of(line: str) -> list[str]:
     bare = re.sub(r"^.*?(\bhood |-m hood\.cli |scripts/(?=rollout|train|evaluate))", "", line, count=1)
     words = shlex.split(bare, comments=True)
     return [words[0].removesuffix(".py"), *(word for word in words[1:] if "…" not in word)]
+
+
+def keys_of(words: list[str]) -> list[str]:
+    """The words with a key; of a sweep those of its first run, without what is Hydra's."""
+    keys = [word for word in words if "=" in word and not word.startswith(("hydra.", "hydra/"))]
+    return [word.split(",")[0] for word in keys] if "-m" in words else keys

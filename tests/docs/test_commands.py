@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig
-from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, of_hood, prose_of, words_of
+from pages import CARDS, EXTENDING, EXTENDING_HAS_A_TEST, PAGES, ROOT, command_lines, keys_of, of_hood, prose_of, words_of
 
 from hood.app.settings.compose import groups, load_config, options, plain
 from hood.app.setup import check_config
@@ -72,7 +72,7 @@ def check_command(command: str, keys: list[str]) -> None:
 def test_commands_have_keys_and_values_that_exist(page: str, line: str) -> None:
     command, *words = words_of(line)
     assert command in COMMANDS, line
-    keys = [word for word in words if "=" in word]
+    keys = keys_of(words)
     if command not in CONFIGURED or set(OWN) & set(keys) or (page == EXTENDING and EXTENDING_HAS_A_TEST):
         return
     check_command(command, keys)
@@ -156,7 +156,7 @@ def test_examples_of_the_help_have_keys_and_values_that_exist(command: str) -> N
     for example in _EXAMPLES[command]:
         name, *words = words_of(example)
         assert name == command
-        check_command(name, [word for word in words if "=" in word])
+        check_command(name, keys_of(words))
 
 
 def test_commands_that_messages_name_exist() -> None:

@@ -119,6 +119,7 @@ SLOW = (
     (r"^rollout .*size=1\.1 stepper", "a factor, as of the line with three"),
     (r"^rollout .*fields:\[rg\].* refine=0", "the same with refine=5"),
     (r"^rollout garment=dress_4k .*material=silk", "a fabric by name, as of the README"),
+    (r"^train -m ", "sweeps, which have tests of their own, as have the two launchers"),
     (r"^train weights=quickstart model=", "weights to start from, as by experiment=quickstart"),
     (r"^plan garment=dress sequence", "the scene of a plan, as of hood plan alone"),
     (r"^sizes garment=dress output", "another garment"),
@@ -184,6 +185,8 @@ def promised(words: Sequence[str]) -> list[str]:
     sheets = ["sheets/*.png"] if "contact_sheets=true" in words else []
     spectrum = {"table": ["spectrum.csv"], "picture": ["spectrum.csv", "spectrum.png"]}.get(value_of(words, "spectrum", ""), [])
     training = any(word.startswith(("experiment=", "trainer", "data.")) for word in words)
+    if "-m" in words:
+        return [f"{output or 'runs/sweep'}/*/{name}" for name in ("model.safetensors", "checkpoint.pt")]
     usual, names = {
         "train": ("runs/train", ["model.safetensors", "metrics.jsonl", "checkpoint.pt"]),
         "evaluate": ("outputs/evaluate", ["table.csv", "table.json", "table1.md", *sheets, *spectrum]),

@@ -13,7 +13,7 @@ from hood.assets.formats.image import Texture, read_texture
 from hood.media.pieces import pieces_of, split_seams
 from hood.media.renderer import raster, render, shading
 from hood.media.renderer import raster as drawing
-from hood.media.renderer.camera import Camera
+from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import Print, RenderMesh, pixels_of, render_frame
 from hood.rollouts.file.reader import RolloutData
 

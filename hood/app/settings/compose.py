@@ -19,7 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.settings.old_names import rename_targets, todays_words
-from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, quoted, readable, require_braces
+from hood.app.settings.overrides import decoded, decoded_text, is_coded, loop, parse, readable, require_braces, search_path
 from hood.assets.files.library import unknown
 from hood.plugins import config_folders, packages, without_options
 
@@ -104,7 +104,7 @@ def with_network(words: Sequence[str]) -> tuple[str, ...]:
 @lru_cache(maxsize=8)
 def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tuple[str, ...]) -> DictConfig:
     """A config that is copied and never changed: a command asks for that of its words several times."""
-    plugins = [f"hydra.searchpath=[{','.join(quoted(f'file://{path}') for path in plugins_of)}]"]
+    plugins = [search_path(plugins_of)]
     with initialize_config_dir(str(folder), version_base="1.3"):
         try:
             defaults = _composed(folder, name, tuple(plugins))
@@ -238,7 +238,7 @@ def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
     """
     changed = copy.deepcopy(config)
     for word in words:
-        _, said = _read_word(word, config)
+        _, said = read_word(word, config)
         if OmegaConf.select(config, said.key_or_group, default=_ABSENT) is _ABSENT:
             raise ConfigError(f"{word}: no such key")
         OmegaConf.update(changed, said.key_or_group, decoded(said.value()), merge=False)
@@ -247,13 +247,13 @@ def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
     if text.split("=")[0] in ("-m", "--multirun"):
-        raise ConfigError(f"{text!r}: {loop(name)}")
+        raise ConfigError(f"{text!r}: only hood train has sweeps; {loop(name)}")
     if text.startswith("-"):
         word = text.lstrip("-") if "=" in text else "key=value"
         raise ConfigError(f"{text!r}: keys have no dashes; write {word}, hood {name} --help lists the keys")
     if "=" not in text and not text.startswith("~"):
         raise ConfigError(f"argument {text!r} is not of the form key=value; keys of {name}: {', '.join(defaults)}")
-    given, (text, override) = text, _read_word(text, defaults)
+    given, (text, override) = text, read_word(text, defaults)
     key = override.get_key_element().lstrip("+~").split("@")[0]
     several = _values_of(key, given, override, defaults)
     if several:
@@ -266,7 +266,7 @@ def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Ov
     return text, override
 
 
-def _read_word(text: str, defaults: DictConfig) -> tuple[str, Override]:
+def read_word(text: str, defaults: DictConfig) -> tuple[str, Override]:
     """A word in the form that Hydra reads, see :func:`hood.app.settings.overrides.readable`, and what it says."""
     try:
         require_braces(text, TABLES)

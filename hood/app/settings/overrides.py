@@ -87,6 +87,9 @@ def require_braces(text: str, tables: Sequence[str]) -> None:
 
 def loop(command: str, key: str = "seed", values: Sequence[str] = ("0", "1")) -> str:
     """The way out for who asks one command for several values of a key."""
+    if command == "train":
+        several = f"{key}={','.join(values)}"
+        return f"a training takes one value of a key, a sweep trains one run for each of several: hood train -m {several}"
     shown = " ".join(values[:_SHOWN_VALUES])
     rollouts = f"for x in {shown}; do hood {command} {key}=$x output=outputs/{key.rpartition('.')[2]}_$x; done"
     return f"a command takes one value of a key, a loop of the shell runs several: {rollouts}"
@@ -95,6 +98,11 @@ def loop(command: str, key: str = "seed", values: Sequence[str] = ("0", "1")) ->
 def quoted(text: str) -> str:
     """Text as Hydra reads it whatever it holds."""
     return "'" + re.sub(r"(\\+)(?=')|(\\+)$", lambda found: 2 * found[0], text).replace("'", "\\'") + "'"
+
+
+def search_path(folders: Sequence[str | Path]) -> str:
+    """The word that tells Hydra where further options lie."""
+    return f"hydra.searchpath=[{','.join(quoted(f'file://{path}') for path in folders)}]"
 
 
 def bare_or_quoted(text: str) -> str:

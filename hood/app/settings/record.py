@@ -47,6 +47,25 @@ def read_record(path: Path) -> dict[str, Any]:
     return named
 
 
+def read_words(path: Path) -> dict[str, str]:
+    """The words of a sweep's run, which Hydra left in ``.hydra/overrides.yaml``: values by keys.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ConfigError: not such a list.
+    """
+    check_size(path, _RECORD_LIMIT)
+    try:
+        text = path.read_text(encoding="utf-8")
+        _require_plain(text)
+        words = yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise ConfigError(f"{path}: not the words of a run ({_one_line(error)[:_REASON]}); remove it") from error
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ConfigError(f"{path}: not the words of a run (no list of words); remove it")
+    return {word.partition("=")[0]: word.partition("=")[2] for word in words}
+
+
 def read_settings(text: str) -> dict[str, Any]:
     """The settings of a rollout as its file keeps them, by today's keys.
 

@@ -25,8 +25,18 @@ from scipy.spatial import cKDTree
 
 from hood.assets.files.said import install
 from hood.assets.formats.image import Texture
-from hood.media.renderer.camera import NEAR, Camera, unit
-from hood.media.renderer.raster import SeenValues, VisibilityBuffer, address, barycentric, library, packed, rasterise
+from hood.media.renderer.raster import (
+    NEAR,
+    Camera,
+    SeenValues,
+    VisibilityBuffer,
+    address,
+    barycentric,
+    library,
+    packed,
+    rasterise,
+    unit,
+)
 from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
 from hood.mesh.topology import counted_edges
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from hood.media.renderer.camera import Camera, unit, view_axes
 from hood.media.renderer.raster import (
+    Camera,
     FloatArray,
     FloorValues,
     LightValues,
@@ -22,6 +22,8 @@ from hood.media.renderer.raster import (
     library,
     packed,
     rasterise,
+    unit,
+    view_axes,
 )
 
 _Array = NDArray[np.float64]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -226,13 +227,10 @@ def test_words_more_are_those_of_the_command_line():
     ("command", "word", "values"),
     [
         ("rollout", "--multirun", "seed"),
-        ("train", "-m", "seed"),
         ("rollout", "seed=0,1", "for x in 0 1; do hood rollout seed=$x output=outputs/seed_$x; done"),
         ("rollout", "seed=range(3)", "for x in …; do hood rollout seed=$x output"),
         ("rollout", "num_frames=choice(3,4)", "for x in …; do hood rollout num_frames=$x"),
         ("rollout", "material=denim,silk", "for x in denim silk; do hood rollout material=$x output=outputs/material_$x; done"),
-        ("train", "trainer.learning_rate=1e-3,1e-4", "for x in 1e-3 1e-4; do hood train trainer.learning_rate=$x "),
-        ("train", "model=ours,small", "for x in ours small; do hood train model=$x"),
     ],
 )
 def test_several_values_of_a_key_are_refused_with_the_loop(command: str, word: str, values: str) -> None:
@@ -242,6 +240,12 @@ def test_several_values_of_a_key_are_refused_with_the_loop(command: str, word: s
         load_config(command, [word])
     assert values in str(told.value)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("word", ["trainer.learning_rate=1e-3,1e-4", "model=ours,small", "seed=range(3)"])
+def test_several_values_of_a_training_are_refused_with_the_sweep(word: str) -> None:
+    with pytest.raises(ConfigError, match=f"hood train -m {re.escape(word.partition('=')[0])}="):
+        load_config("train", [word])
 
 
 def test_trainers_have_the_same_keys() -> None:

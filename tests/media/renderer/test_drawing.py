@@ -7,8 +7,7 @@ import pytest
 
 from hood.media.renderer import raster, render, shading
 from hood.media.renderer import raster as drawing
-from hood.media.renderer.camera import Camera
-from hood.media.renderer.raster import rasterise
+from hood.media.renderer.raster import Camera, rasterise
 from hood.media.renderer.render import RenderMesh, hem_distance, render_frame
 from hood.testing import cylinder
 

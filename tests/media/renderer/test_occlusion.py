@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.media.renderer.camera import Camera
-from hood.media.renderer.raster import VisibilityBuffer
+from hood.media.renderer.raster import Camera, VisibilityBuffer
 from hood.media.renderer.render import RenderMesh, render_frame
 from hood.media.renderer.shading import AROUND, openness
 

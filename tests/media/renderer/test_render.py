@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hood.media import video
-from hood.media.renderer.camera import Camera
-from hood.media.renderer.raster import barycentric, rasterise
+from hood.media.renderer.raster import Camera, barycentric, rasterise
 from hood.media.renderer.render import RenderMesh, contact_sheet, render_frame
 from hood.media.video import VideoWriter, save_png
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hood.assets.formats.image import Texture
-from hood.media.renderer.camera import Camera
+from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import RenderMesh, render_frame
 from hood.media.viewer.page import view_page
 from hood.rollouts.file.reader import RolloutData

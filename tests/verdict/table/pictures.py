@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from hood.media.renderer.camera import Camera
+from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import RenderMesh, contact_sheet, render_frame
 from tests.verdict.table import counts
 from tests.verdict.table.scene import Scene, run_unread
