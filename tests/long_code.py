@@ -1,7 +1,7 @@
 """Modules of more than 300 lines and functions of more than 60, each with its reason; test_rooms.py compares."""
 
 MODULES = {
-    "hood/api.py": "the Python interface: five functions whose docstrings are the reference",
+    "hood/api.py": "the Python interface: six functions whose docstrings are the reference",
     "hood/app/batch/batch.py": "many motions in one command: their folders, what is finished there, the summary over all",
     "hood/app/batch/dress.py": "one command: its words, what it tells, its end, and the dry run",
     "hood/app/batch/engines.py": "four engines with one task, of which the pool of processes is a part",
@@ -11,6 +11,7 @@ MODULES = {
     "hood/app/rollout.py": "one rollout from its words to its summary",
     "hood/app/scene/events.py": "the key `events`: its grammar, its effect, what the summary says of it",
     "hood/app/settings/compose.py": "the only reader of YAML: what is composed, what is refused and the sentences that say so",
+    "hood/app/sweep.py": "one sweep from its words to its table",
     "hood/app/train.py": "one training from its words to its weights",
     "hood/assets/fitting/fit_search.py": "one search over unit, axis, facing, place and arm angle, from coarse to fine",
     "hood/assets/formats/gltf_animation.py": "one chapter of glTF: nodes in time, and the vertices that follow them",

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from omegaconf import DictConfig
@@ -28,8 +29,10 @@ from hood.cli.compare import short_names
 from hood.rollouts.file.dataset import RolloutDataset
 from hood.rollouts.file.reader import RolloutData, published_bytes, read_published, read_rollout, write_rollout
 from hood.steppers.checkpoint import CAUTION, load_simulator, read_header, save_simulator
-from hood.steppers.network import NetworkStepper
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
+
+if TYPE_CHECKING:
+    from hood.steppers.network import NetworkStepper
 
 _MODEL = ".safetensors"
 _PICKLES = (".pkl", ".pickle")
