@@ -11,7 +11,7 @@ MODULES = {
     "hood/app/rollout.py": "one rollout from its words to its summary",
     "hood/app/scene/events.py": "the key `events`: its grammar, its effect, what the summary says of it",
     "hood/app/settings/compose.py": "the only reader of YAML: what is composed, what is refused and the sentences that say so",
-    "hood/app/sweep.py": "one sweep from its words to its table",
+    "hood/app/sweep.py": "one sweep from its words to its runs, here and in a launcher's processes",
     "hood/app/train.py": "one training from its words to its weights",
     "hood/assets/fitting/fit_search.py": "one search over unit, axis, facing, place and arm angle, from coarse to fine",
     "hood/assets/formats/gltf_animation.py": "one chapter of glTF: nodes in time, and the vertices that follow them",
