@@ -59,7 +59,7 @@ _FREE = (*_OF_ROWS, "output", "resume", "fail_on")
 #: Which finished rows are made again.
 _RETRY = ("none", "failed", "unsound")
 #: Rows that a dry run looks at, frames of each, a few and more, and motions that it reads where headers tell no length.
-_PROBES, _PROBE_FRAMES, _READ = 6, (4, 30), 20
+_PROBES, _PROBE_FRAMES, _READ = 12, (4, 30), 20
 #: The sheet of rows: its file, the size of a picture and how many are in a row, and letters of a name.
 _THUMBNAILS, _WIDTH, _HEIGHT, _COLUMNS, _LETTERS = "thumbnails.png", 240, 336, 6, 36
 #: Lines of a list at the end.
@@ -364,15 +364,16 @@ def _tell_plan(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow]
 
 
 def _probed(rows: Sequence[DataRow]) -> list[DataRow]:
-    """A row of every scene as far as there are not too many, else spread over all."""
+    """Rows by chance, as many of every scene, or of scenes that are spread over all where there are too many: motions beside
+    each other are alike."""
     scenes = defaultdict[str, list[DataRow]](list)
     for row in rows:
         scenes[_scene_of(row)].append(row)
     groups = list(scenes.values())
-    if len(groups) >= _PROBES:
-        picked = [groups[place * len(groups) // _PROBES] for place in range(_PROBES)]
-        return [group[len(group) // 2] for group in picked]
-    return [row for group in groups for row in group[:: max(1, -(-len(group) * len(groups) // _PROBES))]][:_PROBES]
+    if len(groups) > _PROBES:
+        groups = [groups[place * len(groups) // _PROBES] for place in range(_PROBES)]
+    most, chance = -(-_PROBES // len(groups)), random.Random(0)
+    return [row for group in groups for row in chance.sample(group, min(most, len(group)))][:_PROBES]
 
 
 def _scene_of(row: DataRow) -> str:
