@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from hood.assets.fitting.worn import lies_in_place
+from hood.assets.fitting.suspicions import lies_in_place
 from hood.assets.garment.binding import PosedBody
 from hood.assets.garment.garment import Garment
 from hood.assets.material import Material
@@ -63,8 +63,8 @@ def worst_part(scene: Scene, pos: np.ndarray) -> str:
     edges = scene.cloth.edges.cpu().numpy()
     if len(parts) == 1 or not len(edges):
         return ""
-    rest = scene.cloth.rest_pos.double().cpu().numpy()
-    now, before = (np.linalg.norm(table[edges[:, 0]] - table[edges[:, 1]], axis=1) for table in (pos, rest))
+    before = scene.cloth.rest_length.double().cpu().numpy()
+    now = np.linalg.norm(pos[edges[:, 0]] - pos[edges[:, 1]], axis=1)
     vertex = edges[int(np.argmax(now / np.maximum(before, 1e-12))), 0]
     return next(name_worn_part(scene, part, len(parts)) for part in parts if vertex in part.vertices)
 
@@ -84,12 +84,12 @@ class Worn:
 
 
 def put_on(garment: Garment, pos: np.ndarray, posed: PosedBody, clearance: float) -> Worn:
-    """The garment worn near ``pos`` (V, 3) [m], outside ``posed``; the lengths of its edges are those of ``rest_pos``.
+    """The garment worn near ``pos`` (V, 3) [m], outside ``posed``; the lengths of its edges are those at rest.
 
     Pushing single vertices out of the body changes the edges between them; settling (:func:`hood.scene.start.settle`)
     spreads that over the cloth around.
     """
-    cloth = build_cloth(garment.rest_pos, garment.faces, Material(), dtype=torch.float64)
+    cloth = build_cloth(garment.rest_pos, garment.faces, Material(), dtype=torch.float64, flat=garment.flat)
     surface, faces = torch.as_tensor(posed.surface), torch.as_tensor(posed.faces)
     scenes = [torch.zeros(len(table), dtype=torch.int64) for table in (surface, faces)]
     obstacle = Obstacle(surface, surface, surface, faces, *scenes)

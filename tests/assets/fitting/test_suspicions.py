@@ -7,8 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hood.assets.body.body import Body
-from hood.assets.fitting.suspicions import suspect_kind, suspect_limbs, suspect_place, suspect_seams, suspect_sides
-from hood.assets.fitting.worn import find_openings
+from hood.assets.fitting.suspicions import (
+    find_openings,
+    suspect_kind,
+    suspect_limbs,
+    suspect_place,
+    suspect_seams,
+    suspect_sides,
+)
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
