@@ -19,6 +19,7 @@ import numpy as np
 
 from hood import native
 from hood.mesh import topology
+from hood.mesh.flat import flat_mesh
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import LAYER_FLAGS, build
 
@@ -106,6 +107,10 @@ class LayerMesh:
             length = np.bincount(sides.reshape(-1), ways, minlength=len(edges)) / np.maximum(count, 1)
         thirds = np.repeat(area / 3.0, 3)
         self.room = vertex_room(rest, faces)
+        if flat is not None:
+            corners, own = flat_mesh(flat)
+            self.room = np.full(len(rest), np.inf)
+            np.minimum.at(self.room, faces.reshape(-1), vertex_room(corners, own))
         self._arrays = {  # in the order of the structure
             "faces": np.ascontiguousarray(faces, np.int32),
             "edges": np.ascontiguousarray(edges, np.int32),

@@ -34,11 +34,11 @@ def laid_out(pos: Tensor, faces: Tensor, flat: np.ndarray | None = None) -> Tens
     return torch.where(torch.isnan(edges).any(dim=(1, 2), keepdim=True), own, edges)
 
 
-def as_mesh(flat: Tensor) -> tuple[Tensor, Tensor]:
-    """Faces (F, 2, 2) [m] side by side: positions (3F, 3) [m] and faces (F, 3), for what takes lengths and areas of a mesh."""
-    corners = flat.new_zeros(len(flat), 3, 3)
+def flat_mesh(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces (F, 2, 2) [m] side by side: positions (3F, 3) [m] and faces (F, 3), for what takes heights of a mesh."""
+    corners = np.zeros((len(flat), 3, 3))
     corners[:, 1:, :2] = flat
-    return corners.reshape(-1, 3), torch.arange(3 * len(flat), device=flat.device).reshape(-1, 3)
+    return corners.reshape(-1, 3), np.arange(3 * len(flat)).reshape(-1, 3)
 
 
 def inverse(flat: Tensor) -> Tensor:
