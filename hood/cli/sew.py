@@ -141,8 +141,8 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
     lines = [
         f"{pattern.name}: {len(pattern.panels)} panels, {len(pattern.stitches)} stitches, {len(sheet.pos)} vertices, "
         f"{len(sheet.faces)} triangles",
-        f"sewn in {sewn.steps} steps, {sewn.seconds:.0f} s: strain p99 {figures.strain_p99:.1%}, {figures.body_crossings} pairs "
-        f"of triangles through the body, {figures.self_crossings} through the cloth, {figures.openings} openings",
+        f"sewn in {sewn.steps} steps, {sewn.seconds:.0f} s: strain p99 {figures.strain_p99:.1%}; triangles through the "
+        f"body {figures.body_crossings}, cloth {figures.self_crossings}; {figures.openings} openings",
     ]
     if sewn.held.any():
         lines.append(f"its waist is held, {int(sewn.held.sum())} vertices; pins=none of hood rollout lets it go")

@@ -38,6 +38,8 @@ _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
 _STRIDE = 0.02
 #: Steps without weight last from the first to the second [s], those under it to the third; so many at most of each.
 _SHORTEST, _DRAWN, _LONGEST, _MOST_DRAWN, _MOST_RESTING = 1e-4, 0.1, 1.0, 160, 60
+#: Of the steps without weight, so many at most once the body has grown: what creeps then goes on under weight.
+_MOST_GROWN = 15
 #: The body grows once steps are so long [s]: before, the seams are open.
 _CLOSED = 2e-3
 #: At rest the vertices move by less than this [m/s] in the mean, without weight by less than the second.
@@ -222,7 +224,7 @@ class _Work:
     def draw_together(self, pos: Tensor) -> tuple[Tensor, int]:
         """The seams closed without weight while the body grows; and the steps that it took."""
         plain = default_potential(friction_coefficient=0.0, contact="strict")
-        potential, share, dt = plain, _THIN, 1e-3
+        potential, share, dt, grown = plain, _THIN, 1e-3, 0
         for count in range(1, _MOST_DRAWN + 1):
             later = min(1.0, share + self._growth) if dt > _CLOSED else share
             now = self._step(potential, pos, dt, self._body(share, later), None, _ROUGH)
@@ -232,7 +234,8 @@ class _Work:
                 continue
             pos, share = now, later
             self.progress.tell(f"step {count}, the body has {share:.0%} of its girth")
-            if share >= 1.0 and dt >= _DRAWN and float(moved.mean()) / dt < _NEARLY:
+            grown += share >= 1.0
+            if grown >= _MOST_GROWN or (grown and dt >= _DRAWN and float(moved.mean()) / dt < _NEARLY):
                 break
             if potential is plain and dt > _CLOSED and not len(self_crossings(pos.numpy(), self.faces)):
                 potential = plain.with_terms(layers=LayerBarrier())

@@ -25,7 +25,7 @@ from hood.testing import cylinder, grid, make_problem
 def _tube(
     columns: int = 12, rows: int = 5, width: float = 0.05, height: float = 0.04
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A flat sheet rolled and closed: positions (V, 3), faces (F, 3) and their flat corners (F, 3, 2). Its columns stay flat."""
+    """A flat sheet, rolled and closed: positions, faces (F, 3), and their flat corners (F, 3, 2)."""
     radius, turn = 0.5 * width / np.sin(np.pi / columns), 2.0 * np.pi / columns
     angle, level = np.meshgrid(turn * np.arange(columns), height * np.arange(rows))
     pos = np.stack([radius * np.sin(angle), level, radius * np.cos(angle)], axis=-1).reshape(-1, 3)

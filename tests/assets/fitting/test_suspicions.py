@@ -18,8 +18,8 @@ from hood.assets.fitting.suspicions import (
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
-from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import build_scene
+from hood.scene.worn import doubts, misplacement
 from hood.testing import grid
 
 #: Openings of the default garments.
