@@ -72,14 +72,14 @@ def skirt(waist: float = 80, hem: float = 132, length: float = 50, top: float = 
 
 def _body(half: float, neck: float, hem: float) -> tuple[Points, Curves]:
     points: Points = [
-        [-half - 1, hem], [half + 1, hem], [half, 130], [19.5, 143], [10, 147], [-10, 147], [-19.5, 143], [-half, 130],
+        [-half - 1, hem], [half + 1, hem], [half, 130], [20.5, 144], [10.5, 148], [-10.5, 148], [-20.5, 144], [-half, 130],
     ]  # fmt: skip
     armhole = {"type": "cubic", "params": [[0.35, 0.2], [0.7, 0.12]]}
     other = {"type": "cubic", "params": [[0.3, 0.12], [0.65, 0.2]]}
     return points, {2: armhole, 4: [0.5, neck], 6: other}
 
 
-def tshirt(half: float = 26, sleeve: float = 18, hem: float = 88) -> dict[str, Any]:
+def tshirt(half: float = 27, sleeve: float = 18, hem: float = 88) -> dict[str, Any]:
     """A T-shirt: front, back, and two panels a sleeve."""
     front, curves = _body(half, 0.9, hem)
     panels = {
@@ -88,7 +88,7 @@ def tshirt(half: float = 26, sleeve: float = 18, hem: float = 88) -> dict[str, A
     }
     stitches = both_sides(8, [1, 3, 5, 7])
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        cap: Points = [[2, -8], [sleeve, -8.5], [sleeve, 8.5], [-3.5, 7]]
+        cap: Points = [[2, -9], [sleeve, -9], [sleeve, 9], [-3.5, 8]]
         shape = cap if sign > 0 else [[-x, y] for x, y in reversed(cap)]
         at = (sign * 25, 136)
         panels[f"{side}_sleeve_front"] = panel(shape, None, (*at, 15), (0, 0, -45 * sign))
