@@ -26,7 +26,7 @@ from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.sewing import Sewn, sew
+from hood.rollouts.sewing import Sewn, sew_around
 
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
@@ -119,7 +119,7 @@ def _sleeved(pattern: Pattern) -> bool:
 
 
 def _attempt(sheet: PatternSheet, posed: PosedBody, material: Material) -> tuple[PosedBody, Sewn]:
-    return posed, sew(sheet, posed, material)
+    return posed, sew_around(sheet, posed, material)
 
 
 def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:

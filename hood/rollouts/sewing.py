@@ -52,7 +52,7 @@ _WAIST = 0.72
 
 
 @dataclass(frozen=True)
-class Figures:
+class SewnFigures:
     """What a sewn garment is judged by.
 
     Args:
@@ -102,13 +102,13 @@ class Sewn:
     held: np.ndarray
     lift: float
     depth: float
-    figures: Figures
+    figures: SewnFigures
     steps: int
     seconds: float
 
 
 @torch.no_grad()
-def sew(sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None) -> Sewn:
+def sew_around(sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None) -> Sewn:
     """The pattern sewn around a body that stands still.
 
     Args:
@@ -130,7 +130,7 @@ def sew(sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndar
     here, drawn = work.draw_together(torch.as_tensor(pos))
     top = float(here[:, 1].max())
     here, resting, speed = work.rest(here, torch.as_tensor(held))
-    figures = measure(cloth, sheet.faces, posed, here, top, speed)
+    figures = judged(cloth, sheet.faces, posed, here, top, speed)
     return Sewn(here.numpy(), held, float(move[1]), float(move[2]), figures, drawn + resting, time.perf_counter() - began)
 
 
@@ -152,15 +152,15 @@ def waist_of(sheet: PatternSheet, height: float) -> np.ndarray:
     return held
 
 
-def measure(cloth: Cloth, faces: np.ndarray, posed: PosedBody, pos: Tensor, top: float, speed: float) -> Figures:
-    """:class:`Figures` of cloth at ``pos`` (V, 3) [m] that began with its highest point at ``top`` [m]."""
+def judged(cloth: Cloth, faces: np.ndarray, posed: PosedBody, pos: Tensor, top: float, speed: float) -> SewnFigures:
+    """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began with its highest point at ``top`` [m]."""
     at = pos.numpy()
     if not np.isfinite(at).all():
-        return Figures(0, 0, math.inf, 0, 0, math.inf, math.inf)
+        return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     start, end = cloth.edges.unbind(dim=1)
     strain = ((pos[end] - pos[start]).norm(dim=1) / cloth.rest_length - 1.0).abs().numpy()
     openings = find_openings(at, faces, posed.surface, posed.faces)
-    return Figures(
+    return SewnFigures(
         len(crossings(at, faces, posed.surface, posed.faces).pairs),
         len(self_crossings(at, faces)),
         float(np.quantile(strain, 0.99)),

@@ -15,14 +15,14 @@ from hood.assets.material import Material
 from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.pattern import read_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
-from hood.rollouts.sewing import Figures, Sewn, sew, waist_of
+from hood.rollouts.sewing import Sewn, SewnFigures, sew_around, waist_of
 
 
 def _sewn(name: str, tmp_path: Path, body: Body, edge: float) -> tuple[PatternSheet, Sewn]:
     path = write(tmp_path / f"{name}.json", PATTERNS[name]())
     sheet = sheet_of(read_pattern(path), edge, str(path))
     angle = 45.0 if name == "tshirt" else 0.0
-    return sheet, sew(sheet, posed_body(body, arms_down(angle), 0, np.zeros(10)), Material())
+    return sheet, sew_around(sheet, posed_body(body, arms_down(angle), 0, np.zeros(10)), Material())
 
 
 @pytest.mark.parametrize("name", ["skirt", "tshirt"])
@@ -58,7 +58,7 @@ def test_a_waist_is_held_where_there_is_one(tmp_path: Path) -> None:
 
 
 def test_every_fault_is_told() -> None:
-    good = Figures(0, 0, 0.1, 4, 0, 0.01, 1e-4)
+    good = SewnFigures(0, 0, 0.1, 4, 0, 0.01, 1e-4)
     assert good.faults == []
     for change, words in (
         ({"body_crossings": 3}, "3 pairs of triangles pass through the body"),
@@ -77,4 +77,4 @@ def test_every_fault_is_told() -> None:
 def test_a_skirt_too_narrow_for_the_body_is_not_passed(tmp_path: Path, body: Body) -> None:
     path = write(tmp_path / "narrow.json", skirt(waist=50, hem=56))
     sheet = sheet_of(read_pattern(path), 0.05, str(path))
-    assert sew(sheet, posed_body(body, arms_down(0.0), 0, np.zeros(10)), Material()).figures.faults
+    assert sew_around(sheet, posed_body(body, arms_down(0.0), 0, np.zeros(10)), Material()).figures.faults

@@ -83,7 +83,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class Panel:
+class PatternPanel:
     """A flat piece of cloth, and where its maker puts it around the body.
 
     Args:
@@ -118,7 +118,7 @@ class Pattern:
     """Panels by name and their stitches."""
 
     name: str
-    panels: Mapping[str, Panel]
+    panels: Mapping[str, PatternPanel]
     stitches: tuple[Stitch, ...]
 
 
@@ -174,7 +174,7 @@ def _numbers(where: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _panel(where: str, name: str, own: Any, scale: float) -> Panel:
+def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     if not isinstance(own, dict) or not isinstance(own.get("edges"), list):
         raise ValueError(f"{where} has no edges; write vertices and edges of its outline, or remove it")
     vertices = scale * _numbers(f"{where}: vertices", own.get("vertices"), (-1, 2))
@@ -197,7 +197,7 @@ def _panel(where: str, name: str, own: Any, scale: float) -> Panel:
     angles = _numbers(f"{where}: rotation", own.get("rotation", [0, 0, 0]), (3,))
     turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     translation = scale * _numbers(f"{where}: translation", own.get("translation", [0, 0, 0]), (3,))
-    return Panel(name, tuple(edges), tuple(numbers), turn, translation, str(own.get("label", "")))
+    return PatternPanel(name, tuple(edges), tuple(numbers), turn, translation, str(own.get("label", "")))
 
 
 def _loop(where: str, ends: list[tuple[int, int]]) -> list[int]:
@@ -260,7 +260,7 @@ def _check_outline(where: str, edges: list[Edge], numbers: list[int]) -> None:
         raise ValueError(f"{where}: its outline crosses itself, edge {first} and edge {second}; move their vertices apart")
 
 
-def _stitch(where: str, own: Any, panels: Mapping[str, Panel]) -> Stitch:
+def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel]) -> Stitch:
     if not isinstance(own, list) or len(own) not in (2, 3) or not all(isinstance(side, dict) for side in own[:2]):
         raise ValueError(f"{where} is no pair of sides; write [{{panel, edge}}, {{panel, edge}}]")
     if len(own) == 3 and own[2] != "right_wrong":

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.pattern import Panel, Pattern
+from hood.assets.pattern.pattern import Pattern, PatternPanel
 from hood.mesh import topology
 
 #: Points inside a panel keep this share of the edge length from its outline.
@@ -109,7 +109,7 @@ def _divisions(pattern: Pattern, edge: float) -> dict[tuple[str, int], int]:
     return counts
 
 
-def _meshed(panel: Panel, counts: list[int], edge: float, where: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+def _meshed(panel: PatternPanel, counts: list[int], edge: float, where: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Points (N, 2) [m] of a panel, its triangles along the outline's way, and the points of every side, ends included."""
     lines = [side.evenly(count)[:-1] for side, count in zip(panel.edges, counts, strict=True)]
     outline = np.concatenate(lines)
