@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,9 +17,6 @@ from torch import Tensor
 
 from hood.assets.files.said import ProgressLines
 from hood.assets.fitting.suspicions import find_openings
-from hood.assets.garment.binding import PosedBody
-from hood.assets.material import Material
-from hood.assets.pattern.sheet import PatternSheet
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import Obstacle, State, StepInput
 from hood.energies.potential import Potential, default_potential
@@ -29,6 +27,11 @@ from hood.mesh.topology import boundary_loops
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.retry import minimize_held_off
+
+if TYPE_CHECKING:
+    from hood.assets.garment.binding import PosedBody
+    from hood.assets.material import Material
+    from hood.assets.pattern.sheet import PatternSheet
 
 #: The thin body has this share of the way from its bones to its skin, and its skin grows by so much [m] a step at most.
 _THIN, _GROWTH = 0.15, 0.006
