@@ -133,8 +133,8 @@ def vertex_strain(data: RolloutData) -> np.ndarray:
         if not np.array_equal(finer.faces, data.cloth_faces[: len(data.cloth_faces) - own_faces]):
             raise ValueError("cloth/faces are not cloth/simulated_faces, refined; simulate it again with hood rollout")
         own = {name: table for name, table in data.still.items() if name == "rest_length"}
-        positions = {"cloth_pos": data.cloth_pos[:, :count], "rest_pos": data.rest_pos[:count]}
-        coarse = replace(data, **positions, cloth_faces=faces, still=own)
+        pos, rest = data.cloth_pos[:, :count], data.rest_pos[:count]
+        coarse = replace(data, cloth_pos=pos, cloth_faces=faces, rest_pos=rest, still=own)
         spread = finer.spread(vertex_strain(coarse).T).T
         return np.concatenate([spread, np.zeros((len(spread), riders))], axis=1)
     faces = np.asarray(data.cloth_faces, dtype=np.int64)

@@ -56,7 +56,8 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     """
     counts = _divisions(pattern, edge)
     tables, faces, outlines, start = [], [], {}, 0
-    placed, owner, labels = [], [], {}
+    placed, owner = [], []
+    labels: dict[str, list[np.ndarray]] = {}
     at = 0.0
     for number, panel in enumerate(pattern.panels.values()):
         points, triangles, sides = _meshed(panel, [counts[panel.name, k] for k in range(len(panel.edges))], edge, where)
@@ -78,19 +79,19 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         pairs.append(np.stack([first, second if stitch.same else second[::-1]], axis=1))
     joined = np.concatenate(pairs)
     label = topology.connected_components(start, joined)
-    _, number = np.unique(label, return_inverse=True)
-    count = np.bincount(number)
-    middle = np.stack([np.bincount(number, pos[:, axis]) for axis in range(3)], axis=1) / count[:, None]
-    names, welded = list(pattern.panels), number[corners]
+    _, welds = np.unique(label, return_inverse=True)
+    count = np.bincount(welds)
+    middle = np.stack([np.bincount(welds, pos[:, axis]) for axis in range(3)], axis=1) / count[:, None]
+    names, welded = list(pattern.panels), welds[corners]
     _check_sheet(welded, of_panel, names, where)
     turned = _turned(welded, of_panel, len(names))
     welded[turned], corners[turned] = welded[turned][:, ::-1], corners[turned][:, ::-1]
     seam = np.zeros(len(count), dtype=bool)
-    seam[number[joined.reshape(-1)]] = True
+    seam[welds[joined.reshape(-1)]] = True
     marks = {}
     for name, sides in labels.items():
         marks[name] = np.zeros(len(count), dtype=bool)
-        marks[name][number[np.concatenate(sides)]] = True
+        marks[name][welds[np.concatenate(sides)]] = True
     own = {name: of_panel == index for index, name in enumerate(names)}
     return PatternSheet(middle, welded, np.concatenate(tables), corners, own, seam, marks)
 
