@@ -182,7 +182,7 @@ def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     for number, edge in enumerate(own["edges"]):
         pair = edge.get("endpoints") if isinstance(edge, dict) else None
         whole = isinstance(pair, list) and len(pair) == 2 and all(type(end) is int and 0 <= end < len(vertices) for end in pair)
-        if not whole:
+        if not whole or pair is None:
             raise ValueError(
                 f"{where}, edge {number}: endpoints are {pair}; give two numbers of vertices below {len(vertices)}"
             )
