@@ -45,6 +45,7 @@ MODULES = {
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",
     "hood/scene/body_motion/mesh_motion.py": "a moving mesh and the points that ride on it",
+    "hood/scene/scene.py": "one scene: its start, what each step prescribes, and how it is built",
     "hood/scene/untangle.py": "one procedure: the order of the layers, then their separation",
     "hood/solver/compiled/system.py": "one object in C++: its buffers, its calls, its float64 form",
     "hood/solver/derivatives/elements.py": "energies and derivatives of every element, and the damping of the same forms",

@@ -292,7 +292,7 @@ def _simulate_to_disk(
         attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
     garment, riders = scene.garment, scene.garment.riders
     attributes |= riding_attributes(riders)
-    still = refined_still(still_of(garment, scene.fastening), finer, garment.faces)
+    still = refined_still(still_of(garment, scene.fastening, scene.cloth), finer, garment.faces)
     stored_rest = scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos
     writer = RolloutWriter(
         path,

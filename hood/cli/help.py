@@ -48,6 +48,10 @@ _EXAMPLES = {
         "hood compare outputs/plain outputs/refined colour=fabric blind=true seed=7 output=outputs/pair_7",
         "hood compare runs/sweep output=runs.csv",
     ],
+    "sew": [
+        "hood sew specification.json output=shirt.npz",
+        "hood sew skirt.json body=default betas=[1.5] edge=0.012 output=skirt.npz",
+    ],
     "fabric": [
         "hood fabric",
         "hood fabric silk_habotai denim_12oz wool_suiting output=outputs/fabrics",
@@ -89,7 +93,7 @@ _EXAMPLES = {
     ],
 }
 #: Words of a command that are no keys.
-_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] "}
+_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] ", "sew": "FILE "}
 
 
 #: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.

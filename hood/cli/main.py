@@ -35,6 +35,7 @@ COMMANDS = {
     "export": "write a rollout for other programs: USD, glTF, PC2, OBJ, PLY",
     "inspect": "say what files are, what is wrong with them and how to repair it",
     "prepare": "repair a garment, fit it to a body and write it for rollouts",
+    "sew": "sew a pattern around a body: the garment, its sheet, and a verdict",
     "fabric": "compare fabrics, and drape them over a disc",
     "sizes": "show several sizes of a garment on several bodies: how each sits, and one sheet",
     "plan": "measure which parts of the model a scene needs, and what each costs",
@@ -54,6 +55,7 @@ _HOMES = {
     "export": "hood.cli.export:run",
     "inspect": "hood.cli.inspect.inspect:run",
     "prepare": "hood.cli.prepare.prepare:run",
+    "sew": "hood.cli.sew:run",
     "fabric": "hood.cli.fabric:run",
     "sizes": "hood.cli.sizes:run",
     "train": "hood.cli.rollout:train",
@@ -66,7 +68,8 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
     2: "an error, told in one line; rollout: a motion of many could not be used; dress: too many rows failed, train -m: a run",
-    3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; dress: too many are",
+    3: "rollout: a result is unsound, or doubtful with fail_on=doubts, or guard=strict ended it; dress: too many are; "
+    "sew: the garment is not sewn well",
     130: "interrupted; what is done is kept",
 }
 
@@ -75,7 +78,7 @@ _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garmen
 #: Words with dashes of commands that take steps; others ask what a command would do.
 _SWEEP = ("-m", "--multirun")
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes")
+_SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes", "sew")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

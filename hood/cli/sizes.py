@@ -123,7 +123,7 @@ def _wear(size: str, shape: tuple[float, ...], config: RolloutSettings, stepper:
         np.zeros(1),
         {},
         {"garment": scene.garment.name},
-        still=still_of(scene.garment),
+        still=still_of(scene.garment, cloth=scene.cloth),
     )
     return _Worn(size, shape, ease, still)
 

@@ -18,6 +18,7 @@ from hood.assets.material import WEAVE, Material
 from hood.cloth.fabric import FabricMap
 from hood.mesh import geometry, topology
 from hood.mesh.editing.quality import check_triangles
+from hood.mesh.flat import edge_lengths, laid_out, rest_angles, rest_of
 from hood.tensors.batch import concatenate, indexes
 from hood.tensors.dense import add_rows
 
@@ -107,6 +108,7 @@ class Cloth:
     # None where the fabric is the same in all directions
     weave: Tensor | None = None  # (F, 3) factors on its stiffness along the warp, along the weft and in shear
     grain: Tensor | None = None  # (F, 2) warp as shares of the edges x₁ - x₀ and x₂ - x₀; zero where it plays no role
+    flat: Tensor | None = None  # (F, 2, 2) m, those edges in the flat pattern (:mod:`hood.mesh.flat`); None: as in rest_pos
     num_scenes: int = 1
 
     @property
@@ -141,7 +143,15 @@ class Cloth:
     @cached_property
     def rest_edge_sq(self) -> Tensor:
         """Squares [m²] (E,) of the rest lengths of the edges."""
-        return self.edge_sq(self.rest_pos)
+        return self.edge_sq(self.rest_pos) if self.flat is None else self.rest_length.square()
+
+    @cached_property
+    def rest_length(self) -> Tensor:
+        """Lengths [m] (E,) of the edges at rest: of a flat pattern those in its faces."""
+        if self.flat is not None:
+            return edge_lengths(self.flat, self.faces, self.edges)
+        start, end = self.edges.unbind(dim=1)
+        return (self.rest_pos[end] - self.rest_pos[start]).norm(dim=1)
 
     @cached_property
     def mean_edge(self) -> float:
@@ -168,6 +178,7 @@ def build_cloth(
     stiffness: np.ndarray | None = None,
     dtype: torch.dtype = torch.float32,
     uv: tuple[np.ndarray, np.ndarray] | None = None,
+    flat: np.ndarray | None = None,
 ) -> Cloth:
     """Cloth of one garment.
 
@@ -185,6 +196,8 @@ def build_cloth(
         flat_rest: take 0 as rest angle of every hinge instead of the angle in ``rest_pos``.
         uv: texture coordinates (U, 2) and those of every face's corners, (F, 3): along v runs the warp of a fabric that has
             one. None: see :func:`hood.cloth.cloth.grain_of`.
+        flat: (F, 3, 2) [m], the corners of every face in the flat pattern, whose lengths, areas and angles are then those at
+            rest; of faces of NaN those of ``rest_pos`` are. None: of all. The warp runs along its second axis.
 
     Raises:
         ValueError: the mesh cannot be simulated (see :func:`hood.mesh.editing.quality.check_triangles`), a fabric's field or
@@ -218,6 +231,11 @@ def build_cloth(
         "hinge_area": area[torch.as_tensor(hinge_table.faces)].sum(dim=1),
         "rest_angle": torch.zeros_like(angle) if flat_rest else angle,
     }
+    if flat is not None:
+        shape = laid_out(pos, tri, flat)
+        real |= rest_of(shape, tri, hinges, density, len(points))
+        real["rest_angle"] = torch.zeros_like(angle) if flat_rest else rest_angles(pos, hinges, hinge_table.faces, flat)
+        uv = (flat.reshape(-1, 2), np.arange(flat[..., 0].size).reshape(-1, 3))
     weave = np.stack([fabric.on_faces(name) for name in WEAVE], axis=1)
     if (weave != 1.0).any():
         grain = torch.as_tensor(grain_of(points, triangles, uv))
@@ -241,6 +259,8 @@ def concatenate_cloths(cloths: Sequence[Cloth]) -> Cloth:
     counts = {"vertices": [c.num_vertices for c in cloths], "scenes": [c.num_scenes for c in cloths]}
     if any(cloth.weave is not None for cloth in cloths):
         cloths = [cloth if cloth.weave is not None else _without_grain(cloth) for cloth in cloths]
+    if any(cloth.flat is not None for cloth in cloths):
+        cloths = [c if c.flat is not None else replace(c, flat=laid_out(c.rest_pos, c.faces)) for c in cloths]
     return concatenate(cloths, counts)
 
 

@@ -18,6 +18,7 @@ from hood.cloth.state import Obstacle
 from hood.contact.contact import Contact, match_surface
 from hood.mesh import topology
 from hood.mesh.closest_point.search import build_incidence
+from hood.mesh.flat import masses
 from hood.mesh.geometry import normals_of_fans, vertex_masses
 from hood.tensors.batch import made_of
 from hood.tensors.dense import add_rows
@@ -95,10 +96,17 @@ def _midpoints(cloth: Cloth) -> _Midpoints:
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     side = torch.as_tensor(topology.edge_index(edges, sides), device=cloth.faces.device)
     area = add_rows(cloth.rest_area.new_zeros(len(edges)), side, cloth.rest_area.repeat_interleave(3) / 3.0)
-    share = area / vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[cloth.edges].mean(dim=1)
+    share = area / _cloth_areas(cloth)[cloth.edges].mean(dim=1)
     rim = torch.as_tensor(np.bincount(side.cpu().numpy(), minlength=len(edges)) == 1, device=share.device)
     found = made["midpoints"] = _Midpoints(cloth.edges[:, [0, 1, 1]], share, cloth.edge_scene, rim)
     return found
+
+
+def _cloth_areas(cloth: Cloth) -> Tensor:
+    """(V,) m², a third of the faces around every vertex at rest."""
+    if cloth.flat is not None:
+        return masses(cloth.flat, cloth.faces, 1.0, cloth.num_vertices)
+    return vertex_masses(cloth.rest_pos, cloth.faces, 1.0)
 
 
 def _match_midpoints(place: str, middles: _Midpoints, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:
@@ -133,7 +141,7 @@ def _match_skin(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, conta
     faces_it = (along <= across.abs()) | (match.dist.abs() <= _CLOSE)
     kept = ((match.dist.abs() <= _CAP) & same_side & faces_it).nonzero().squeeze(1)
     vertices, weights = vertices[kept], match.bary[kept]
-    of_cloth = (weights * vertex_masses(cloth.rest_pos, cloth.faces, 1.0)[vertices]).sum(dim=1)
+    of_cloth = (weights * _cloth_areas(cloth)[vertices]).sum(dim=1)
     of_skin = vertex_masses(obstacle.pos, obstacle.faces, 1.0)[rows[kept]]
     # A floor's vertex stands for more than the cloth that meets it.
     share = (of_skin / of_cloth).clamp(max=1.0)

@@ -190,9 +190,12 @@ def _meshes(cloth: Cloth, reach: float) -> list[tuple[LayerMesh, int, int]]:
     if known is not None and known[0]() is cloth.faces:
         return known[1]
     rest, faces = cloth.rest_pos.cpu().double().numpy(), cloth.faces.cpu().numpy()
+    flat = None if cloth.flat is None else cloth.flat.double().cpu().numpy()
     bounds = torch.searchsorted(cloth.vertex_scene.cpu(), torch.arange(cloth.num_scenes + 1)).tolist()
     scene, made = cloth.face_scene.cpu().numpy(), []
     for index, (first, last) in enumerate(zip(bounds, bounds[1:], strict=False)):
-        made.append((LayerMesh(rest[first:last], faces[scene == index] - first, reach), first, last))
+        own = scene == index
+        mesh = LayerMesh(rest[first:last], faces[own] - first, reach, None if flat is None else flat[own])
+        made.append((mesh, first, last))
     _MESHES[key] = weakref.ref(cloth.faces, forget(_MESHES, key)), made
     return made

@@ -171,16 +171,22 @@ def _make_constants(cloth: Cloth) -> _Constants:
     roots = weave_roots(cloth, torch.float64)
     weave = [] if roots is None else [_padded(roots.t())]
     sizes = [(len(elements), table[1].shape[-1]) for elements, table in zip((cloth.faces, cloth.hinges), kept, strict=False)]
-    ends = cloth.edges.unbind(dim=1)
-    rest = cloth.rest_pos.double()
     return _Constants(
         _Faces(*sizes[0], *(array.ctypes.data for array in (*kept[0], *weave))),
         _Hinges(*sizes[1], 0, *(array.ctypes.data for array in kept[1])),
         _Hinges(*sizes[1], 1, *(array.ctypes.data for array in kept[2])),
         _whole(cloth.edges),
-        _whole((rest[ends[1]] - rest[ends[0]]).norm(dim=1)),
+        _whole(_rest_length(cloth)),
         [array for table in (*kept, weave) for array in table],
     )
+
+
+def _rest_length(cloth: Cloth) -> Tensor:
+    """(E,) m in float64: of edges of a mesh the difference is not rounded."""
+    if cloth.flat is not None:
+        return cloth.rest_length.double()
+    rest, (start, end) = cloth.rest_pos.double(), cloth.edges.unbind(dim=1)
+    return (rest[end] - rest[start]).norm(dim=1)
 
 
 def _padded(values: Tensor) -> np.ndarray:

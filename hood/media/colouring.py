@@ -132,12 +132,16 @@ def vertex_strain(data: RolloutData) -> np.ndarray:
         riders, own_faces = data.riding
         if not np.array_equal(finer.faces, data.cloth_faces[: len(data.cloth_faces) - own_faces]):
             raise ValueError("cloth/faces are not cloth/simulated_faces, refined; simulate it again with hood rollout")
-        coarse = replace(data, cloth_pos=data.cloth_pos[:, :count], cloth_faces=faces, rest_pos=data.rest_pos[:count], still={})
+        own = {name: table for name, table in data.still.items() if name == "rest_length"}
+        pos, rest = data.cloth_pos[:, :count], data.rest_pos[:count]
+        coarse = replace(data, cloth_pos=pos, cloth_faces=faces, rest_pos=rest, still=own)
         spread = finer.spread(vertex_strain(coarse).T).T
         return np.concatenate([spread, np.zeros((len(spread), riders))], axis=1)
     faces = np.asarray(data.cloth_faces, dtype=np.int64)
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    rest = np.linalg.norm(data.rest_pos[edges[:, 0]] - data.rest_pos[edges[:, 1]], axis=1)
+    rest = np.linalg.norm(data.rest_pos[edges[:, 0]] - data.rest_pos[edges[:, 1]], axis=1).astype(np.float64)
+    flat = data.still.get("rest_length", rest[:0])  # edges of what rides on the cloth come after its own
+    rest[: len(flat)] = flat
     result = np.zeros(data.cloth_pos.shape[:2])
     for frame, pos in enumerate(data.cloth_pos):
         strain = np.abs(np.linalg.norm(pos[edges[:, 0]] - pos[edges[:, 1]], axis=1) / rest - 1.0)

@@ -19,6 +19,7 @@ import numpy as np
 
 from hood import native
 from hood.mesh import topology
+from hood.mesh.flat import flat_mesh
 from hood.native.arguments import COUNT, POINTER, REAL, fields
 from hood.native.build import LAYER_FLAGS, build
 
@@ -89,17 +90,27 @@ class LayerMesh:
         faces: (F, 3).
         reach: m, distance at which features are near each other. Where faces are small it is half of the smallest height of
             the faces around: at rest nothing is near anything.
+        flat: (F, 2, 2) m, edges x₁ - x₀ and x₂ - x₀ of the faces in a flat pattern, where lengths and areas are those of one.
     """
 
-    def __init__(self, rest_pos: np.ndarray, faces: np.ndarray, reach: float) -> None:
+    def __init__(self, rest_pos: np.ndarray, faces: np.ndarray, reach: float, flat: np.ndarray | None = None) -> None:
         rest, faces = np.asarray(rest_pos, np.float64), np.asarray(faces, np.int64)
         edges = topology.unique_edges(faces)
         sides = topology.edge_index(edges, faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)).reshape(-1, 3)
         length = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
         normal = np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]])
         area = 0.5 * np.linalg.norm(normal, axis=1)
+        if flat is not None:
+            area = 0.5 * np.abs(np.linalg.det(flat))
+            ways = np.linalg.norm(np.stack([flat[:, 0], flat[:, 1] - flat[:, 0], flat[:, 1]], axis=1), axis=2).reshape(-1)
+            count = np.bincount(sides.reshape(-1), minlength=len(edges))
+            length = np.bincount(sides.reshape(-1), ways, minlength=len(edges)) / np.maximum(count, 1)
         thirds = np.repeat(area / 3.0, 3)
         self.room = vertex_room(rest, faces)
+        if flat is not None:
+            corners, own = flat_mesh(flat)
+            self.room = np.full(len(rest), np.inf)
+            np.minimum.at(self.room, faces.reshape(-1), vertex_room(corners, own))
         self._arrays = {  # in the order of the structure
             "faces": np.ascontiguousarray(faces, np.int32),
             "edges": np.ascontiguousarray(edges, np.int32),

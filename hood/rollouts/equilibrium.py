@@ -7,24 +7,27 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from hood.assets.files.said import ProgressLines
-from hood.cloth.cloth import Cloth
 from hood.cloth.state import Attachments, State, StepInput
-from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.mesh.parts import find_parts
 from hood.mesh.topology import connected_components
-from hood.scene.scene import Scene
 from hood.scene.worn import name_worn_part, worn_vertices
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.retry import minimize_held_off
 from hood.solver.step_figures import NOT_FINITE
 from hood.tensors.batch import to_device
 from hood.tensors.dense import add_rows
+
+if TYPE_CHECKING:
+    from hood.cloth.cloth import Cloth
+    from hood.energies.potential import Potential
+    from hood.scene.scene import Scene
 
 #: Steps begin with the first and grow to the second [s]; they last longer while no vertex moves much farther than the third
 #: [m] in one: contact is searched once a step, and finds the body within a decimetre.

@@ -60,7 +60,7 @@ class KeptFrames:
             time=np.arange(len(self.cloth)) * self.scene.dt,
             metrics={name: np.array([row.get(name, np.nan) for row in self.metrics]) for name in sorted(names)},
             attributes={"garment": self.scene.garment.name},
-            still=still_of(self.scene.garment),
+            still=still_of(self.scene.garment, cloth=self.scene.cloth),
         )
 
 

@@ -14,6 +14,7 @@ from hood.assets.material import Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import Attachments, State, StepInput, centres_of
+from hood.mesh.flat import followed
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
 from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
@@ -272,9 +273,10 @@ def dressed_scene(garment: Garment, motion: Motion, material: Material | None = 
     garment = motion.dressed(garment)
     sizes = size if isinstance(size, Sizes) else sizes_of(size)
     rest_pos = (motion.rest_pos(garment) if sizes.to_measure else garment.rest_pos) * np.array(sizes.start)
-    fabric = material or Material()
     uv = None if garment.uv is None or garment.uv_faces is None else (garment.uv, garment.uv_faces)
-    cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=garment.stiffness, dtype=motion.dtype, uv=uv)
+    flat = None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, rest_pos)
+    fabric, firm = material or Material(), garment.stiffness
+    cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=firm, dtype=motion.dtype, uv=uv, flat=flat)
     cloth = to_device(cloth, motion.device)
     fastening = fastening_of(garment.fasteners, cloth.rest_pos)
     return Scene(cloth, garment, motion, 1.0 / motion.fps, sizes=sizes, fastening=fastening)

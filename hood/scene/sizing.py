@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth, along_grain
 from hood.mesh import geometry
+from hood.mesh.flat import followed, rest_of
 
 #: Sizes outside are no garment's.
 LEAST, MOST = 0.2, 5.0
@@ -85,10 +86,17 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
         "hinge_rest_length": (pos[hinges[:, 1]] - pos[hinges[:, 0]]).norm(dim=1),
         "hinge_area": sum(geometry.triangle_areas(pos, hinges[:, [0, 1, side]]) for side in (2, 3)),  # type: ignore[dict-item]
     }
+    if cloth.flat is not None:
+        corners = torch.cat([torch.zeros_like(cloth.flat[:, :1]), cloth.flat], dim=1).double().cpu().numpy()
+        grown = followed(corners, cloth.faces.cpu().numpy(), cloth.rest_pos.double().cpu().numpy(), pos.cpu().numpy())
+        flat = torch.as_tensor(grown[:, 1:], device=pos.device)
+        real |= rest_of(flat, cloth.faces, hinges, cloth.density.double(), cloth.num_vertices)
     if cloth.grain is not None:
         real["rest_inverse"] = along_grain(real["rest_inverse"], cloth.grain.double())
     if len(set(share.tolist())) > 1:
         change = geometry.dihedral_angles(pos, hinges) - geometry.dihedral_angles(cloth.rest_pos.double(), hinges)
+        if cloth.flat is not None:  # a pattern stays flat
+            change = torch.where(cloth.rest_angle == 0.0, 0.0, change)
         real["rest_angle"] = cloth.rest_angle.double() + change
     rounded: dict[str, Any] = {name: value.to(cloth.rest_pos.dtype) for name, value in real.items()}
     return replace(cloth, **rounded)

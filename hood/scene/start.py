@@ -65,14 +65,14 @@ def leave_by_centroids(cloth: Cloth, pos: Tensor, obstacle: Obstacle, clearance:
 def free_stretch(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative lengthening (E,) of the edges at ``pos`` (V, 3); zero where both ends are held: nothing can be done there."""
     start, end = cloth.edges.unbind(dim=1)
-    rest_length = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
+    rest_length = cloth.rest_length
     return ((pos[end] - pos[start]).norm(dim=1) / rest_length - 1.0) * (cloth.free[start] | cloth.free[end])
 
 
 def _project(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, iterations: int) -> Tensor:
     """Over-relaxed Jacobi projections: plain averaging needs about twice the iterations."""
     start, end = cloth.edges.unbind(dim=1)
-    rest_length = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
+    rest_length = cloth.rest_length
     free = cloth.free.to(pos.dtype)
     share = free[start] + free[end]
     valence = torch.zeros_like(free).index_add(0, start, share.sign()).index_add(0, end, share.sign()).clamp_min(1.0)
@@ -102,7 +102,7 @@ def _unstretch(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: 
     in a crease stay behind the others in a sum of squares; their weights w grow until they count.
     """
     start, end = cloth.edges.unbind(dim=1)
-    rest_length = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
+    rest_length = cloth.rest_length
     weight = torch.ones_like(rest_length)
     stretch = free_stretch(cloth, pos)
     best, least = pos, float(stretch.max()) if len(stretch) else 0.0

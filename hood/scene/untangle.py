@@ -332,7 +332,7 @@ class _Course:
     ) -> None:
         self._outfit, self._order, self._clearance = outfit, order, clearance
         cloth, self._sheets = outfit.cloth, _sheets(outfit, pos, obstacle)
-        self._rest_length = (cloth.rest_pos[cloth.edges[:, 1]] - cloth.rest_pos[cloth.edges[:, 0]]).norm(dim=1)
+        self._rest_length = cloth.rest_length
         self._weight = torch.ones_like(self._rest_length)
         self._gap = torch.full_like(pos[:, 0], _GAP)
         self._search, self._course = LazySearch(cloth, obstacle), Momentum(pos)

@@ -60,8 +60,7 @@ def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
 def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative length change of every edge, (E,), signed."""
     start, end = cloth.edges.unbind(dim=1)
-    rest = (cloth.rest_pos[end] - cloth.rest_pos[start]).norm(dim=1)
-    return (pos[end] - pos[start]).norm(dim=1) / rest - 1.0
+    return (pos[end] - pos[start]).norm(dim=1) / cloth.rest_length - 1.0
 
 
 def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:

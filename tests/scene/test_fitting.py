@@ -10,8 +10,8 @@ from hood.assets.garment.binding import bind_posed, posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.sequence_edit import arms_down
-from hood.scene.fitting import fit_figures
 from hood.scene.scene import build_scene
+from hood.scene.worn import fit_figures
 
 
 @pytest.mark.parametrize("name", ["tshirt", "dress"])

@@ -146,6 +146,9 @@ def _with_cut(garment: Garment, cut: Cut) -> Garment:
             rows[key] = along(cut, getattr(garment, key))
     if garment.uv is not None and garment.uv_faces is not None:
         rows["uv_faces"], rows["uv"] = along_corners(cut, garment.uv_faces, garment.uv)
+    if garment.flat is not None:
+        corners, values = along_corners(cut, np.arange(3 * len(garment.flat)).reshape(-1, 3), garment.flat.reshape(-1, 2))
+        rows["flat"] = values[corners]
     panels = {name: mask[cut.parent] for name, mask in (garment.panels or {}).items()} or None
     return replace(garment, **rows, faces=cut.faces, panels=panels, normal_faces=_corner_marks(garment, cut))
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hood.assets.contents.garments import tell_apart
-from hood.assets.contents.layers import drop_copies, to_one_layer
+from hood.assets.contents.garments import drop_copies, tell_apart, to_one_layer
 from hood.assets.contents.objects import choose_objects, leave_body_out
 from hood.assets.contents.panels import sew_panels, sew_stitches
 from hood.assets.contents.small_parts import let_ride

@@ -38,6 +38,7 @@ def place(fitting: Fitting, placement: Placement) -> None:
         rest_turn=None if rest_turn is None else turn @ rest_turn @ turn.T,
         riders=None if garment.riders is None else replace(garment.riders, pos=placement.apply(garment.riders.pos)),
         thickness=None if garment.thickness is None else placement.scale * garment.thickness,
+        flat=None if garment.flat is None else placement.scale * garment.flat,
     )
     count, offset = len(garment.rest_pos), np.round(placement.offset, 4).tolist()
     if placement.scale != 1.0:
@@ -192,6 +193,8 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
     resolves. Vertices keep their numbers; those left over are of no face. Edges of no length are a fault of the file, which
     is refused where cloth is made of it.
     """
+    if garment.flat is not None:  # lengths are those of the pattern
+        return garment, 0
     edges = topology.unique_edges(garment.faces)
     lengths = _lengths(garment.rest_pos, edges)
     short = edges[(lengths > 0.0) & (lengths < SHORT * np.median(lengths))] if len(edges) else edges
@@ -215,6 +218,8 @@ def turn_flat_faces(garment: Garment) -> tuple[Garment, int]:
 
     Their stiffness across is without bounds. Vertices keep their numbers.
     """
+    if garment.flat is not None:
+        return garment, 0
     corners, parent, count = turn_caps(garment.rest_pos, garment.faces)
     if not count:
         return garment, 0
@@ -254,7 +259,7 @@ _PER_VERTEX = (
     "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
     "thickness",
 )  # fmt: skip
-_PER_FACE = ("faces", "uv_faces", "normal_faces")
+_PER_FACE = ("faces", "uv_faces", "normal_faces", "flat")
 
 
 def keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:

@@ -18,7 +18,7 @@ import numpy as np
 
 from hood.assets.fitting.placement import UPWARD, Placement, Surrounding, find_scale, possible, size_ratio, surrounds, used
 from hood.assets.fitting.skin_field import WIDTH, Size, Skin, SkinField, find_size, misfit, settle_field, sleeve_misfit
-from hood.assets.fitting.worn import lies_in_place
+from hood.assets.fitting.suspicions import lies_in_place
 
 #: Angles [degrees] of the arms around which all translations are tried, the steps of the finer search, and the greatest.
 ARM_ANGLES = (0.0, 30.0, 60.0)

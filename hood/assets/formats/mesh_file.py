@@ -20,8 +20,7 @@ from hood.assets.formats.gltf import read_glb
 from hood.assets.formats.obj_off_stl import read_obj, read_off, read_stl
 from hood.assets.formats.ply import read_ply
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable
-from hood.mesh.editing.polygons import MAX_CORNERS, triangulate
-from hood.mesh.editing.quality import far_vertex
+from hood.mesh.editing.quality import MAX_CORNERS, far_vertex, triangulate
 from hood.mesh.parts import part_labels
 
 _READERS: dict[str, Callable[[Path], RawMesh]] = {
@@ -75,7 +74,7 @@ def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
     """A mesh file (OBJ, PLY, OFF, STL, GLB, and the formats of plugins).
 
     Args:
-        split_polygons: split faces of four and more corners (:func:`hood.mesh.editing.polygons.triangulate`) instead of
+        split_polygons: split faces of four and more corners (:func:`hood.mesh.editing.quality.triangulate`) instead of
             refusing them.
 
     Raises:

@@ -15,6 +15,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import topology
 from hood.mesh.closest_point.search import search_surface
+from hood.mesh.flat import followed
 
 #: Distance [m] over which the body's influence on a garment vertex halves: beyond it neighbours decide.
 _BINDING_REACH = 0.03
@@ -110,9 +111,11 @@ def bind_posed(garment: Garment, posed: PosedBody, worn_pos: np.ndarray | None =
     offset = shapedirs[..., :count] @ posed.betas[:count]
     straight = np.allclose(turn, np.eye(3), atol=1e-9)
     as_given = straight and np.array_equal(worn_pos, garment.rest_pos)
+    mean = garment.rest_pos - np.einsum("vij,vj->vi", turn, offset)
     return replace(
         garment,
-        rest_pos=garment.rest_pos - np.einsum("vij,vj->vi", turn, offset),
+        rest_pos=mean,
+        flat=None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, mean),
         skin_pos=None if as_given else grown - offset,
         rest_turn=None if straight else turn,
         lbs_weights=weights,

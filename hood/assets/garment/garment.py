@@ -53,6 +53,7 @@ class Garment:
         None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
     )
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
+    flat: np.ndarray | None = None  # (F, 3, 2) m, corners in the flat pattern: the cloth's lengths. NaN, None: as in rest_pos
     thickness: np.ndarray | None = None  # (V,) m, of the cloth as its file shows it; 0: not known. The fabric has its own
     riders: Riders | None = None  # buttons and the like, which ride on the cloth
     file_numbers: np.ndarray | None = None  # (V of the file,) present number of each of its vertices, -1: gone; None: as there

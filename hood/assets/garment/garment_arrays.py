@@ -92,6 +92,8 @@ def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, An
     for key in _CORNERS:
         if key in arrays and (key != "uv_faces" or "uv" in fields):
             fields[key] = _corner_table(where, key, arrays[key], fields)
+    if "flat" in arrays:
+        fields["flat"] = _flat(where, arrays["flat"], len(fields["faces"]))
     levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
     if levels:
         fields["coarse_edges"] = tuple(_edge_table(where, key, arrays[key]) for key in levels)
@@ -246,6 +248,19 @@ def _panel(where: str, key: str, value: Any, num_faces: int) -> np.ndarray:
     if mask.dtype.kind != "b" or mask.shape != (num_faces,):
         raise ValueError(f"{where}: {key} is {mask.dtype} {mask.shape}; give one bool a face, ({num_faces},)")
     return mask
+
+
+def _flat(where: str, value: Any, num_faces: int) -> np.ndarray:
+    """Corners of the faces in the flat pattern: all of a face or none, and an area."""
+    flat = _reals(where, "flat", value)
+    if flat.shape != (num_faces, 3, 2):
+        raise ValueError(f"{where}: flat has shape {flat.shape}; give metres of every face's corners, ({num_faces}, 3, 2)")
+    known = np.isfinite(flat).all(axis=(1, 2))
+    area = np.abs(np.linalg.det(flat[:, 1:] - flat[:, :1]))
+    bad = np.where(known, area <= 0.0, ~np.isnan(flat).all(axis=(1, 2)))
+    if bad.any():
+        raise ValueError(f"{where}: flat of face {int(bad.argmax())} is no triangle; repair it, or leave flat out")
+    return flat
 
 
 def _corner_table(where: str, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:

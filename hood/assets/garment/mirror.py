@@ -79,6 +79,8 @@ def mirror_garment(garment: Garment) -> Garment:
     """The image of a garment, bound to the image of the body it was bound to."""
     image: dict[str, Any] = {"rest_pos": garment.rest_pos * _SIDES}
     image |= {key: _reversed(table) for key in _CORNERS if (table := getattr(garment, key)) is not None}
+    if garment.flat is not None:
+        image["flat"] = _reversed(garment.flat) * [-1.0, 1.0]
     if garment.shapedirs is not None:
         image["shapedirs"] = garment.shapedirs * _SIDES[:, None]
     if garment.skin_pos is not None:

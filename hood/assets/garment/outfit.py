@@ -47,6 +47,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
         fasteners=_join_fasteners(garments, starts),
         panels=_join_panels(garments),
+        flat=_join_flat(garments),
         thickness=_join_rows(garments, "thickness", lambda garment: np.zeros(len(garment.rest_pos))),
         riders=join_riders([garment.riders for garment in garments], starts.tolist(), _uv_starts(garments)),
         file_numbers=_join_numbers(garments, starts),
@@ -127,6 +128,13 @@ def _join_panels(garments: Sequence[Garment]) -> dict[str, np.ndarray] | None:
             others = [mask if other == place else np.zeros(size, dtype=bool) for other, size in enumerate(counts)]
             panels[_free(name, panels)] = np.concatenate(others)
     return panels or None
+
+
+def _join_flat(garments: Sequence[Garment]) -> np.ndarray | None:
+    """Flat faces of those that have them; the others keep the rest shape of their mesh."""
+    if all(garment.flat is None for garment in garments):
+        return None
+    return np.concatenate([np.full((len(g.faces), 3, 2), np.nan) if g.flat is None else g.flat for g in garments])
 
 
 def _free(name: str, taken: Mapping[str, np.ndarray]) -> str:

@@ -19,6 +19,7 @@ from hood.assets.files.text import meant, read_indices
 from hood.assets.formats.image import read_texture
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.pins import REGIONS
+from hood.mesh.flat import followed
 
 #: Colours of vertices that are names of parts.
 COLOURS = ("red", "green", "blue")
@@ -191,7 +192,8 @@ def tailored(garment: Garment, factors: Mapping[str, float], body: Body | None =
     rest_pos, riders = _stretched(garment.rest_pos, garment.faces, factor), garment.riders
     if riders is not None:
         riders = replace(riders, pos=riders.positions(rest_pos, garment.rest_pos))
-    return replace(garment, rest_pos=rest_pos, skin_pos=garment.worn_pos, riders=riders)
+    flat = None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, rest_pos)
+    return replace(garment, rest_pos=rest_pos, skin_pos=garment.worn_pos, riders=riders, flat=flat)
 
 
 def lengths_of(before: Garment, after: Garment, part: str, body: Body | None = None) -> float:

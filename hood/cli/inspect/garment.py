@@ -17,8 +17,7 @@ from hood.assets.contents.objects import Item, items_of, num_openings
 from hood.assets.contents.sort_out import metres_per_unit
 from hood.assets.fitting.fit_search import AskedFit, FoundFit
 from hood.assets.fitting.placement import LENGTH_UNITS, find_scale, size_ratio, used
-from hood.assets.fitting.suspicions import suspect_place, suspect_sides
-from hood.assets.fitting.worn import way_there
+from hood.assets.fitting.suspicions import suspect_place, suspect_sides, way_there
 from hood.assets.garment.binding import signed_distances
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import FILE, Change

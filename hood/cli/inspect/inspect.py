@@ -35,8 +35,8 @@ from hood.cli.inspect import findings
 from hood.cli.inspect.findings import Finding
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.mesh_motion import MeshMotion
-from hood.scene.fitting import fit_figures, misplacement
 from hood.scene.scene import LEAD_IN, NotWornError, Scene, dressed_scene
+from hood.scene.worn import fit_figures, misplacement
 
 #: A root that moves faster [m/s] than this in one of a hundred frames is no person's.
 _FASTEST = 20.0

@@ -37,8 +37,8 @@ from hood.assets.garment.record import Fitting
 from hood.mesh.editing.quality import check_triangles
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.mesh_motion import MeshMotion
-from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import dressed_scene
+from hood.scene.worn import FitFigures, fit_figures
 
 
 def fasten_as_asked(fitting: Fitting, config: DictConfig) -> np.ndarray:

@@ -50,9 +50,8 @@ from hood.assets.motion.skeleton import UP_AXES
 from hood.cli.prepare.mesh_body import fasten_as_asked, give_room, prepare_for_mesh
 from hood.media.exports.sequences import write_obj
 from hood.mesh.editing.quality import check_triangles
-from hood.scene.fitting import FitFigures, fit_figures
 from hood.scene.scene import build_scene
-from hood.scene.worn import STRETCHED, Worn, put_on
+from hood.scene.worn import STRETCHED, FitFigures, Worn, fit_figures, put_on
 
 #: A start beyond these is warned about: edges stretched by this share, vertices this deep [m].
 _STRETCH_LIMIT, _DEPTH_LIMIT = 0.10, 2e-3

@@ -16,6 +16,7 @@ import numpy as np
 
 from hood.assets.files.guarded import own_dataset, own_group
 from hood.assets.garment.garment import Garment
+from hood.cloth.cloth import Cloth
 from hood.rollouts.file.step_table import RowWriter, StepPlan, StepTable, step_paths, still_step_paths
 from hood.scene.holding import Fastening
 
@@ -44,14 +45,17 @@ STILL = {
     "fastened": np.int32,
     "fastened_row": np.int32,
     "fastened_length": np.float64,
+    "rest_length": np.float64,
     "simulated_faces": np.int32,
     "pinned": np.int32,
 }
 
 
-def still_of(garment: Garment, fastening: Fastening | None = None) -> dict[str, np.ndarray]:
+def still_of(garment: Garment, fastening: Fastening | None = None, cloth: Cloth | None = None) -> dict[str, np.ndarray]:
     """What a file holds of the garment and its fasteners beside its mesh, by the names of :data:`STILL`."""
     found = {} if garment.piece is None else {"piece": garment.piece}
+    if cloth is not None and cloth.flat is not None:
+        found["rest_length"] = cloth.rest_length.double().cpu().numpy()
     if garment.pinned.any():
         found["pinned"] = np.flatnonzero(garment.pinned)
     if fastening is not None:
@@ -70,7 +74,8 @@ class RolloutWriter:
     ``metrics/* (T,)``, of every vertex ``cloth/NAME (T,V)`` for each name in ``fields``, and those of :data:`STILL` that are
     given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, which garment of an outfit a vertex belongs to,
     ``cloth/piece (V,)``, which vertices are held, ``cloth/pinned (P,)``, and pairs of vertices that are fastened to each other,
-    ``cloth/fastened (A,2)``, with the number of their row and the distance [m] that they are held at; attributes:
+    ``cloth/fastened (A,2)``, with the number of their row and the distance [m] that they are held at, and of a garment that
+    has a flat pattern the lengths of its edges there, ``cloth/rest_length (E,)`` [m]; attributes:
     ``num_frames`` done so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32,
     positions far from the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy
     which float32 does not resolve.

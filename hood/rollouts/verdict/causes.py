@@ -144,14 +144,13 @@ def _is_hidden(bad: np.ndarray, meshes: Meshes) -> bool:
     if not over or not len(meshes.body_faces):
         return False
     edges = unique_edges(meshes.faces)
-    rest = np.linalg.norm(meshes.rest_pos[edges[:, 1]] - meshes.rest_pos[edges[:, 0]], axis=1)
     places = np.unique(np.linspace(0, len(over) - 1, min(len(over), _LOOKED_AT)).astype(np.int64))
     for frame in [over[place] for place in places]:
         pos, body = meshes.cloth[frame].astype(np.float64), meshes.body[frame].astype(np.float64)
         if not np.isfinite(body).all():
             return False
         length = np.linalg.norm(pos[edges[:, 1]] - pos[edges[:, 0]], axis=1)
-        torn = edges[np.abs(length / rest - 1.0) > STRAIN_UNSOUND.value]
+        torn = edges[np.abs(length / meshes.rest_length - 1.0) > STRAIN_UNSOUND.value]
         shown = visible(pos[torn].mean(axis=1), [(pos, meshes.faces), (body, meshes.body_faces)])
         if shown.sum() > _SHARE * len(edges):
             return False
@@ -195,7 +194,7 @@ def strain_of(data: RolloutData, meshes: Meshes, finite: np.ndarray) -> np.ndarr
     strain = np.full(len(finite), np.nan)
     if len(start) == 0:
         return np.where(finite, 0.0, strain)
-    rest = np.linalg.norm(meshes.rest_pos[end] - meshes.rest_pos[start], axis=1)
+    rest = meshes.rest_length
     for frame in np.flatnonzero(finite):
         pos = meshes.cloth[frame].astype(np.float64)
         strain[frame] = np.quantile(np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / rest - 1.0), 0.99)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -226,12 +227,20 @@ class Meshes:
     piece: np.ndarray | None  # (V,) garment of an outfit
     step: np.ndarray  # (T,) the simulated frame of each, or the nearest
     pinned: np.ndarray  # (P,) vertices that are held, as far as the file says
+    flat_length: np.ndarray | None = None  # (E,) m, edges at rest where that is a flat pattern; None: as in rest_pos
+
+    @cached_property
+    def rest_length(self) -> np.ndarray:
+        """(E,) m at rest, of the unique edges of ``faces``."""
+        if self.flat_length is not None:
+            return self.flat_length
+        start, end = unique_edges(self.faces.astype(np.int64)).T
+        return np.asarray(np.linalg.norm(self.rest_pos[end] - self.rest_pos[start], axis=1))
 
     @property
     def edge_length(self) -> float:
         """The median of its edges at rest [m]."""
-        start, end = unique_edges(self.faces.astype(np.int64)).T
-        return float(np.median(np.linalg.norm(self.rest_pos[end] - self.rest_pos[start], axis=1))) if len(start) else 0.0
+        return float(np.median(self.rest_length)) if len(self.rest_length) else 0.0
 
 
 def meshes_of(data: RolloutData) -> Meshes:
@@ -252,6 +261,7 @@ def meshes_of(data: RolloutData) -> Meshes:
         None if piece is None else piece[:count],
         step,
         data.still.get("pinned", np.zeros(0, dtype=np.int64)).astype(np.int64),
+        data.still.get("rest_length"),
     )
 
 

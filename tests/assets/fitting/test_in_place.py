@@ -9,7 +9,7 @@ import pytest
 
 from hood.assets.body.body import Body
 from hood.assets.fitting.fit_search import AskedFit, Wearer, find_placement
-from hood.assets.fitting.worn import lies_in_place, way_there
+from hood.assets.fitting.suspicions import lies_in_place, way_there
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence_edit import arms_down

@@ -7,13 +7,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hood.assets.body.body import Body
-from hood.assets.fitting.suspicions import suspect_kind, suspect_limbs, suspect_place, suspect_seams, suspect_sides
-from hood.assets.fitting.worn import find_openings
+from hood.assets.fitting.suspicions import (
+    find_openings,
+    suspect_kind,
+    suspect_limbs,
+    suspect_place,
+    suspect_seams,
+    suspect_sides,
+)
 from hood.assets.garment.binding import posed_body
 from hood.assets.garment.garment import Garment
 from hood.assets.motion.load import load_sequence
-from hood.scene.fitting import doubts, misplacement
 from hood.scene.scene import build_scene
+from hood.scene.worn import doubts, misplacement
 from hood.testing import grid
 
 #: Openings of the default garments.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hood.mesh.editing.polygons import newell_normal, triangulate
+from hood.mesh.editing.quality import newell_normal, triangulate
 
 
 def areas(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:

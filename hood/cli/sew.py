@@ -1,0 +1,206 @@
+"""``hood sew FILE``: a sewing pattern in, the garment that it makes on a body out, judged before it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig
+
+from hood.app.common import prepare_folder, require_package, split_words
+from hood.app.scene.fabrics import fabric_named
+from hood.app.scene.garments import shape_coefficients
+from hood.app.scene.placing import AUTO, arm_angle
+from hood.app.settings.compose import ConfigError, options, shown
+from hood.assets.body.load import load_body
+from hood.assets.files.library import unknown
+from hood.assets.garment.binding import PosedBody, bind_posed, posed_body
+from hood.assets.garment.garment import Garment, save_garment
+from hood.assets.material import Material
+from hood.assets.motion.sequence_edit import arms_down
+from hood.assets.pattern.pattern import Pattern, read_pattern
+from hood.assets.pattern.sheet import PatternSheet, sheet_of
+from hood.media.exports.sequences import write_obj
+from hood.media.film import Film
+from hood.media.renderer.render import contact_sheet
+from hood.media.video import save_png
+from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.sewing import Sewn, sew_around
+
+#: Exit code of a garment that is not sewn well.
+UNSEWN = 3
+_FINEST, _COARSEST = 0.004, 0.1
+#: Arms of the poses of the T and the A, degrees below the former.
+_TPOSE, _APOSE = 0.0, 45.0
+#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
+_BESIDE, _HIGH = 0.19, 0.9
+_WIDTH, _HEIGHT = 420, 560
+#: Between panels in the picture [m], and pixels for its title.
+_MARGIN, _TITLE = 0.02, 36
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    words, config = split_words("sew", arguments)
+    if len(words) != 1:
+        given = f"{len(words)} files are given" if words else "no file is given"
+        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz")
+    path, edge = Path(words[0]).expanduser(), _number(config, "edge", _FINEST, _COARSEST)
+    gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
+    if angle is None and str(config.pose) != AUTO:
+        raise ConfigError(f"pose={shown(config.pose)}: give tpose, apose, degrees of the arms below the T-pose, or auto")
+    if str(config.material) not in options("material"):
+        raise ConfigError(unknown("fabric", str(config.material), options("material")))
+    material = fabric_named(str(config.material))
+    pattern = read_pattern(path, gathers)
+    target = _target(config, pattern)
+    picture = _picture(config, target)
+    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
+    sheet = sheet_of(pattern, edge, str(path))
+    prepare_folder(target.parent)
+    angles = [angle] if angle is not None else ([_APOSE, _TPOSE] if _sleeved(pattern) else [_TPOSE, _APOSE])
+    found = [_attempt(sheet, posed_body(body, arms_down(angles[0]), 0, betas), material)]
+    if found[0][1].figures.faults and len(angles) > 1:
+        found.append(_attempt(sheet, posed_body(body, arms_down(angles[1]), 0, betas), material))
+    posed, sewn = min(found, key=lambda one: len(one[1].figures.faults))
+    worn = _garment(pattern, sheet, sewn)
+    print("\n".join(_report(pattern, sheet, sewn)))
+    if picture is not None:
+        prepare_folder(picture.parent)
+        save_png(picture, _sheet(worn, sheet, posed))
+        print(f"written: {picture}")
+    faults = sewn.figures.faults
+    if faults:
+        unsewn = target.with_suffix(".unsewn.obj")
+        write_obj(unsewn, worn)
+        print(
+            f"not sewn: {'; '.join(faults)}. How far it came is in {unsewn}; try another pose= or body=, or alter the pattern"
+        )
+        return UNSEWN
+    save_garment(target, bind_posed(worn, posed))
+    print(f"written: {target}")
+    return 0
+
+
+def _number(config: DictConfig, key: str, low: float, high: float) -> float:
+    value = config[key]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise ConfigError(f"{key}={shown(value)}: give a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _target(config: DictConfig, pattern: Pattern) -> Path:
+    target = Path(f"{pattern.name or 'garment'}.npz" if config.output is None else str(config.output)).expanduser()
+    if target.suffix != ".npz":
+        raise ConfigError(f"output={target}: garments are .npz files")
+    return target
+
+
+def _picture(config: DictConfig, target: Path) -> Path | None:
+    """Where the sheet goes; None for none."""
+    word = str(config.sheet)
+    if word == "none":
+        return None
+    picture = target.with_suffix(".png") if word == AUTO else Path(word).expanduser()
+    if picture.suffix != ".png":
+        raise ConfigError(f"sheet={word}: sheets are .png files; give one, auto or none")
+    require_package("PIL", "Pillow", "pictures", "the sheet of hood sew (sheet=none draws none)")
+    return picture
+
+
+def _sleeved(pattern: Pattern) -> bool:
+    """Whether a panel is one of a sleeve, by its label or its place."""
+    for panel in pattern.panels.values():
+        middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
+        if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
+            return True
+    return False
+
+
+def _attempt(sheet: PatternSheet, posed: PosedBody, material: Material) -> tuple[PosedBody, Sewn]:
+    return posed, sew_around(sheet, posed, material)
+
+
+def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:
+    """The garment as it hangs; its lengths are those of the pattern."""
+    return Garment(
+        pattern.name,
+        sewn.pos,
+        sheet.faces,
+        sewn.held,
+        uv=sheet.uv,
+        uv_faces=sheet.uv_faces,
+        panels=dict(sheet.panels),
+        flat=sheet.flat,
+    )
+
+
+def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
+    figures = sewn.figures
+    lines = [
+        f"{pattern.name}: {len(pattern.panels)} panels, {len(pattern.stitches)} stitches, {len(sheet.pos)} vertices, "
+        f"{len(sheet.faces)} triangles",
+        f"sewn in {sewn.steps} steps, {sewn.seconds:.0f} s: strain p99 {figures.strain_p99:.1%}; triangles through the "
+        f"body {figures.body_crossings}, cloth {figures.self_crossings}; {figures.openings} openings",
+    ]
+    if sewn.held.any():
+        lines.append(f"its waist is held, {int(sewn.held.sum())} vertices; pins=none of hood rollout lets it go")
+    return lines
+
+
+def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody) -> np.ndarray:
+    """The pattern, and the garment from front, side and back."""
+    still = RolloutData(
+        worn.rest_pos[None],
+        worn.faces,
+        worn.rest_pos,
+        posed.surface[None],
+        posed.faces,
+        np.zeros(1),
+        {},
+        {"garment": worn.name},
+    )
+    views = [Film(still, _WIDTH, _HEIGHT, azimuth_deg=azimuth).frame(0) for azimuth in (0.0, 90.0, 180.0)]
+    return contact_sheet([_drawn(sheet), *views], 4, ["pattern", "front", "side", "back"])
+
+
+def _drawn(sheet: PatternSheet) -> np.ndarray:
+    """The panels side by side, in rows of about equal width, as a picture: their outlines and the mesh in them."""
+    from PIL import Image, ImageDraw
+
+    boxes = []
+    for mask in _by_height(sheet):
+        corners = sheet.uv[sheet.uv_faces[mask]]
+        boxes.append((corners - corners.min(axis=(0, 1)), np.ptp(corners, axis=(0, 1)) + _MARGIN))
+    wide = max(float(np.sqrt(sum(size.prod() for _, size in boxes) * _WIDTH / _HEIGHT)), *(float(size[0]) for _, size in boxes))
+    placed, at, low, tall = [], 0.0, 0.0, 0.0
+    for corners, size in boxes:
+        if at and at + size[0] > 1.1 * wide:
+            at, low, tall = 0.0, low + tall, 0.0
+        placed.append(corners + [at, low])
+        at, tall = at + float(size[0]), max(tall, float(size[1]))
+    every = np.concatenate(placed)
+    scale = 0.92 * min(_WIDTH / np.ptp(every[..., 0]), (_HEIGHT - _TITLE) / np.ptp(every[..., 1]))
+    points = scale * (every - every.min(axis=(0, 1)))
+    points[..., 1] = scale * np.ptp(every[..., 1]) - points[..., 1]
+    points += [0.5 * (_WIDTH - points[..., 0].max()), _TITLE]
+    image = Image.new("RGB", (_WIDTH, _HEIGHT), "white")
+    pen = ImageDraw.Draw(image)
+    for triangle in points.tolist():
+        pen.polygon([tuple(corner) for corner in triangle], fill=(214, 226, 240), outline=(160, 182, 208))
+    sides = np.sort(sheet.uv_faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, first, count = np.unique(sides, axis=0, return_index=True, return_counts=True)
+    order = np.concatenate([np.flatnonzero(mask) for mask in _by_height(sheet)])
+    row = np.empty(len(order), dtype=np.int64)
+    row[order] = np.arange(len(order))
+    for side in first[count == 1].tolist():
+        face, corner = divmod(side, 3)
+        ends = points[row[face], [corner, (corner + 1) % 3]]
+        pen.line([tuple(end) for end in ends.tolist()], fill=(30, 60, 110), width=2)
+    return np.asarray(image)
+
+
+def _by_height(sheet: PatternSheet) -> list[np.ndarray]:
+    """The panels, the tallest first."""
+    return sorted(sheet.panels.values(), key=lambda mask: -float(np.ptp(sheet.uv[sheet.uv_faces[mask]][..., 1])))

@@ -1,0 +1,161 @@
+"""Sewing patterns: what is read, what is refused by name, and the sheet that their panels make."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sewing_patterns import PATTERNS, panel, skirt, specification, write
+
+from hood.assets.pattern.pattern import Edge, read_pattern
+from hood.assets.pattern.sheet import PatternSheet, sheet_of
+from hood.mesh import topology
+
+#: Openings of every pattern.
+_OPENINGS = {"skirt": 2, "tshirt": 4, "bodice": 4, "trousers": 3}
+
+
+def _sheet(tmp_path: Path, content: dict[str, Any], edge: float = 0.04) -> PatternSheet:
+    path = write(tmp_path / "pattern.json", content)
+    return sheet_of(read_pattern(path), edge, str(path))
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_panels_weld_to_an_oriented_sheet_with_the_lengths_of_the_pattern(name: str, tmp_path: Path) -> None:
+    content = PATTERNS[name]()
+    sheet = _sheet(tmp_path, content)
+    half = sheet.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    assert len(np.unique(half, axis=0)) == len(half)  # every edge is passed once each way
+    assert len(topology.boundary_loops(sheet.faces)) == _OPENINGS[name]
+    assert len(np.unique(topology.connected_components(len(sheet.pos), topology.unique_edges(sheet.faces)))) == 1
+    area = 0.5 * np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1]))
+    pattern = read_pattern(tmp_path / "pattern.json")
+    for key, mask in sheet.panels.items():
+        fine = np.concatenate([edge.evenly(200)[:-1] for edge in pattern.panels[key].edges])
+        x, y = fine.T
+        whole = 0.5 * abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+        assert area[mask].sum() == pytest.approx(whole, rel=0.02)  # chords of curves
+    assert sum(mask.sum() for mask in sheet.panels.values()) == len(sheet.faces)
+
+
+def test_a_unit_is_one_of_length(tmp_path: Path) -> None:
+    content = skirt()
+    centimetres = _sheet(tmp_path, content)
+    for own in content["pattern"]["panels"].values():
+        own["vertices"] = [[3.0 * x, 3.0 * y] for x, y in own["vertices"]]
+        own["translation"] = [3.0 * x for x in own["translation"]]
+    content["properties"]["units_in_meter"] = 300
+    np.testing.assert_allclose(_sheet(tmp_path, content).pos, centimetres.pos, atol=1e-12)
+    assert np.ptp(centimetres.pos[:, 1]) == pytest.approx(0.5)
+
+
+def test_curves_bulge_to_the_side_that_they_say() -> None:
+    start, end, none = np.zeros(2), np.array([2.0, 0.0]), np.zeros((0, 2))
+    middle = np.array([0.5])
+    for right, y in ((True, -1.0), (False, 1.0)):
+        arc = Edge(start, end, none, (1.0, False, right))
+        np.testing.assert_allclose(arc.at(middle), [[1.0, y]], atol=1e-12)
+        assert arc.length == pytest.approx(np.pi, rel=1e-3)
+    large = Edge(start, end, none, (2.0, True, True))
+    small = Edge(start, end, none, (2.0, False, True))
+    assert large.length + small.length == pytest.approx(4.0 * np.pi, rel=1e-3)
+    np.testing.assert_allclose(Edge(start, end, np.array([[1.0, 1.0]])).at(middle), [[1.0, 0.5]])
+    steps = np.linalg.norm(np.diff(Edge(start, end, np.array([[0.2, 1.0]])).evenly(9), axis=0), axis=1)
+    assert np.ptp(steps) < 0.02 * steps.mean()
+
+
+def test_both_forms_of_a_curve_are_one(tmp_path: Path) -> None:
+    content = skirt()
+    old = _sheet(tmp_path, content)
+    for own in content["pattern"]["panels"].values():
+        for edge in own["edges"]:
+            if "curvature" in edge:
+                edge["curvature"] = {"type": "quadratic", "params": [edge["curvature"]]}
+    np.testing.assert_array_equal(_sheet(tmp_path, content).pos, old.pos)
+
+
+def test_a_placement_turns_about_x_then_y_then_z(tmp_path: Path) -> None:
+    square = panel([[0, 0], [50, 0], [50, 50], [0, 50]], None, (0, 100, 0), (90, 90, 0))
+    sheet = _sheet(tmp_path, specification({"square": square}, []))
+    # y goes to z about x, which goes to x about y; x goes to -z.
+    assert np.ptp(sheet.pos, axis=0) == pytest.approx([0.5, 0.0, 0.5])
+    assert sheet.pos[:, 0].max() == pytest.approx(0.5)
+    assert sheet.pos[:, 2].min() == pytest.approx(-0.5)
+
+
+def test_gathers_are_spread_by_share_of_length(tmp_path: Path) -> None:
+    points = [[-20, 0], [20, 0], [20, 30], [-20, 30]]
+    wide = [[-40, 30], [40, 30], [40, 60], [-40, 60]]
+    content = specification({"a": panel(points), "b": panel(wide)}, [("a", 2, "b", 0)])
+    sheet = _sheet(tmp_path, content, 0.05)
+    assert len(topology.boundary_loops(sheet.faces)) == 1
+    with pytest.raises(ValueError, match=r"stitch 0 joins panel 'a', edge 2 \(40.0 cm\) and panel 'b', edge 0 \(80.0 cm\)"):
+        read_pattern(tmp_path / "pattern.json", most_gathered=1.5)
+
+
+def test_right_to_wrong_runs_in_one_direction(tmp_path: Path) -> None:
+    points = [[0, 0], [40, 0], [40, 30], [0, 30]]
+    content = specification({"a": panel(points), "b": panel(points, None, (0, 0, 5))}, [("a", 1, "b", 1)])
+    content["pattern"]["stitches"][0].append("right_wrong")
+    sheet = _sheet(tmp_path, content)
+    half = sheet.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    assert len(np.unique(half, axis=0)) == len(half)  # one of the panels was turned over
+    seam = sheet.pos[sheet.seam]
+    assert np.allclose(seam[:, 0], 0.4)
+    assert np.allclose(seam[:, 2], 0.025)
+    assert np.allclose(np.sort(seam[:, 1]), np.linspace(0.0, 0.3, len(seam)))
+
+
+def _spoiled(change: Any) -> dict[str, Any]:
+    content = copy.deepcopy(skirt())
+    change(content["pattern"])
+    return content
+
+
+_FAULTS = {
+    r"panel 'front': its outline crosses itself, edge 1 and edge 3; move": lambda p: p["panels"]["front"][
+        "vertices"
+    ].__setitem__(slice(None), [[-30, 0], [30, 0], [-20, 50], [20, 50]]),
+    r"panel 'front', edge 2: no edge begins at its end, vertex 3; close": lambda p: p["panels"]["front"]["edges"].pop(),
+    r"panel 'front', edge 1: the outline is no loop there; let": lambda p: p["panels"]["front"]["edges"][2].update(
+        endpoints=[1, 3]
+    ),
+    r"stitch 0: there is no panel 'side'; remove": lambda p: p["stitches"][0][0].update(panel="side"),
+    r"stitch 0: panel 'front' has no edge 9; remove the stitch": lambda p: p["stitches"][0][0].update(edge=9),
+    r"panel 'front', edge 1 is in stitches 0 and 1; divide": lambda p: p["stitches"][1][0].update(edge=1),
+    r"panel 'front', edge 1 has no length; merge": lambda p: p["panels"]["front"]["vertices"].__setitem__(2, [33.0, 0.0]),
+    r"panel 'front': vertices is not n × 2 finite numbers": lambda p: p["panels"]["front"].update(vertices=[[0, "x"]]),
+    r"panel 'front', edge 0: endpoints are \[0, 7\]": lambda p: p["panels"]["front"]["edges"][0].update(endpoints=[0, 7]),
+    r"edge 1: its curvature is of type 'spline'": lambda p: p["panels"]["front"]["edges"][1].update(
+        curvature={"type": "spline", "params": []}
+    ),
+}
+
+
+@pytest.mark.parametrize("message", _FAULTS)
+def test_faults_are_named(message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"pattern\.json: .*" + message):
+        _sheet(tmp_path, _spoiled(_FAULTS[message]))
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"pattern": {}}', '{"pattern": {"panels": {"a": 3}}}'])
+def test_other_files_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text(text)
+    with pytest.raises(ValueError, match=r"other\.json: "):
+        read_pattern(tmp_path / "other.json")
+
+
+def test_three_layers_in_a_seam_are_refused(tmp_path: Path) -> None:
+    points = [[0, 0], [30, 0], [30, 30], [0, 30]]
+    content = specification({key: panel(points) for key in "abc"}, [("a", 1, "b", 3), ("a", 3, "c", 1), ("c", 3, "b", 1)])
+    assert len(topology.boundary_loops(_sheet(tmp_path, content).faces)) == 2  # a ring of three
+    closed = specification({"a": panel(points), "b": panel(points)}, [("a", k, "b", k) for k in range(4)])
+    assert not topology.boundary_loops(_sheet(tmp_path, closed).faces)
+    tube = specification({"a": panel(points), "b": panel(points)}, [("a", 0, "a", 2), ("a", 1, "b", 3)])
+    with pytest.raises(ValueError, match="more than two layers of cloth meet in one seam, of panels 'a'; remove"):
+        _sheet(tmp_path, tube, 0.15)
+    with pytest.raises(ValueError, match="panel 'a' is sewn to itself over one edge; give a smaller edge="):
+        _sheet(tmp_path, tube, 0.3)

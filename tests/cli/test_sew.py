@@ -1,0 +1,86 @@
+"""``hood sew``: the garment file, the sheet, the exit codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sewing_patterns import skirt, write
+
+import hood
+from hood.assets.garment.garment import load_garment
+from hood.cli.main import main
+from hood.mesh.flat import edge_lengths
+from hood.mesh.topology import unique_edges
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_a_skirt_from_its_pattern_to_a_rollout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("PIL")
+    path, target = write(tmp_path / "skirt.json", skirt()), tmp_path / "out" / "skirt.npz"
+    assert main(["sew", str(path), "edge=0.05", f"output={target}"]) == 0
+    text = capsys.readouterr().out
+    assert "2 panels, 2 stitches" in text
+    assert "pins=none" in text
+    assert target.with_suffix(".png").stat().st_size > 10_000
+    garment = load_garment(target)
+    assert garment.flat is not None
+    assert set(garment.panels or {}) == {"front", "back"}
+    scene = hood.build_scene(garment, hood.load_body(), hood.load_sequence("plie"))
+    flat = torch.as_tensor(garment.flat[:, 1:] - garment.flat[:, :1])
+    edges = torch.as_tensor(unique_edges(garment.faces))
+    lengths = edge_lengths(flat, torch.as_tensor(garment.faces), edges)
+    assert float((scene.cloth.rest_length.double() / lengths - 1.0).abs().max()) < 1e-3
+    frames = list(hood.simulate(garment, "plie", num_frames=4))
+    assert max(frame.metrics["strain_p99"] for frame in frames) < 0.1
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_what_is_not_sewn_well_is_kept_for_a_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, target = write(tmp_path / "narrow.json", skirt(waist=50, hem=56)), tmp_path / "narrow.npz"
+    assert main(["sew", str(path), "edge=0.06", "pose=tpose", "sheet=none", f"output={target}"]) == 3
+    text = capsys.readouterr().out
+    assert "not sewn: " in text
+    assert "it is stretched by" in text
+    assert not target.exists()
+    assert len(load_garment(target.with_suffix(".unsewn.obj")).faces) > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "no file is given: write one"),
+        (["a.json", "b.json"], "2 files are given"),
+        (["none.json"], "no such file"),
+        (["skirt.json", "edge=9"], "edge=9: give a number from 0.004 to 0.1"),
+        (["skirt.json", "gathers=true"], "gathers=true: give a number"),
+        (["skirt.json", "pose=run"], "pose=run: give tpose, apose"),
+        (["skirt.json", "output=a.obj"], "output=a.obj: garments are .npz files"),
+        (["skirt.json", "sheet=a.jpg"], "sheet=a.jpg: sheets are .png files"),
+        (["skirt.json", "material=steel"], "steel"),
+        (["broken.json"], "not JSON"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "skirt.json", skirt())
+    (tmp_path / "broken.json").write_text("{")
+    assert main(["sew", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.json", "skirt.json"]
+
+
+def test_panels_stand_in_the_file(tmp_path: Path) -> None:
+    """The warp of a panel is its y."""
+    path, target = write(tmp_path / "skirt.json", skirt()), tmp_path / "skirt.npz"
+    assert main(["sew", str(path), "edge=0.08", "sheet=none", f"output={target}"]) == 0
+    garment = load_garment(target)
+    scene = hood.build_scene(garment, hood.load_body(), hood.load_sequence("plie"), hood.Material(warp=3.0))
+    assert garment.flat is not None
+    assert scene.cloth.grain is not None
+    warp = np.einsum("fi,fix->fx", scene.cloth.grain.double().numpy(), garment.flat[:, 1:] - garment.flat[:, :1])
+    assert float(np.degrees(np.abs(np.arctan2(warp[:, 0], warp[:, 1]))).max()) < 1.0
