@@ -196,9 +196,9 @@ def test_a_folder_with_something_in_it_stays(tmp_path: Path, capsys: pytest.Capt
 def test_too_large_a_glb_is_refused_before_it_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hood.media.exports import gltf
+    from hood.media.exports import scene_files
 
-    monkeypatch.setattr(gltf, "_LARGEST", 1000)
+    monkeypatch.setattr(scene_files, "_LARGEST", 1000)
     assert main(["export", str(_rollout(tmp_path)), "format=glb"]) == 2
     assert "num_frames=" in capsys.readouterr().err
     assert not (tmp_path / "rollout.glb").exists()

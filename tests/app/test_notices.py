@@ -38,7 +38,7 @@ def test_every_command_is_heard(capsys: pytest.CaptureFixture[str], monkeypatch:
         warnings.warn("it fell", stacklevel=1)
         return 0
 
-    monkeypatch.setattr(main, "_command", lambda name: command)
+    monkeypatch.setattr(main, "_command", lambda *_: command)
     assert main.main(["inspect"]) == 0
     assert capsys.readouterr().err == "hood: warning: it fell\n"
 

@@ -15,6 +15,7 @@ import torch
 from pages import ROOT, blocks
 from PIL import Image
 from reference_oracle import make_state
+from sewing_patterns import skirt, write
 from workshop import Workshop, write_obj
 
 from hood.assets.garment.garment import Garment, load_garment, save_garment
@@ -48,6 +49,7 @@ class Desk:
             (r"outputs/plan/plan\.json", self.plan),
             (r"([\w/]+/)?\w+\.safetensors", self.model),
             (r"postcvpr\.pth", self.published),
+            (r"specification\.json", self.sewing_pattern),
             (r"SMPL_NEUTRAL\.pkl", self.smpl),
             (r"garments_dict\.pkl", self.published_garments),
             (r"vto/\w+\.csv", self.split),
@@ -98,6 +100,9 @@ class Desk:
 
         made = self._once("rollout", make) / "made"
         return made / "rollout.h5" if name.endswith(".h5") else made
+
+    def sewing_pattern(self, name: str, words: Sequence[str]) -> Path:
+        return self._once("sewing_pattern", lambda folder: write(folder / name, skirt())) / name
 
     def data_set(self, name: str, words: Sequence[str]) -> Path:
         """What ``hood dress`` leaves of one row."""

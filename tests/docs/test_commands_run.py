@@ -45,6 +45,7 @@ SHORT = (
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
     Short("^dress", ("num_frames=2", "workers=1", "engine=local"), "one process here; engines have tests elsewhere"),
     Short("^dress(?!.*rows=)", ("garments=[tank]", "fabrics=[default]"), "two rows; their product has tests elsewhere"),
+    Short("^sew", ("edge=0.05", "sheet=none"), "a coarse mesh; the sheet has a test of its own"),
     Short("^train", BRIEF, "one update with one scene; the networks are as large as the lines'"),
     Short(
         "^train.*paper_fast.*time_scale=0.13", ("trainer.iterations=15", "trainer.statistics_iterations=1"),
@@ -127,7 +128,7 @@ SLOW = (
     (r"^(inspect|prepare) .*my_shirt\.obj( my_walk\.npz)?$", "files of another name"),
 )
 #: Commands that are told which files to read; their bare names, as the text has them, ask for those.
-READERS = {"inspect", "prepare", "view", "export", "compare", "convert"}
+READERS = {"inspect", "prepare", "view", "export", "compare", "convert", "sew"}
 
 
 def chosen(line: str) -> list[str]:
@@ -176,6 +177,8 @@ def promised(words: Sequence[str]) -> list[str]:
     if command == "export":
         form = value_of(words, "format", "glb")
         return [f"{output}/*.{form}"] if form == "pc2" else [output or f"{read[0]}/rollout.{form}"]
+    if command == "sew":
+        return [output]
     if command in ("view", "convert"):
         return [
             output or ("view.html" if command == "view" else value_of(words, "checkpoint", "").replace(".pth", ".safetensors"))
