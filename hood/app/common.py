@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import torch
 from omegaconf import DictConfig
 
-from hood.app.settings.compose import ConfigError, brief, load_config, plain, require_choice
+from hood.app.settings.compose import SWEEP_FLAGS, ConfigError, brief, load_config, plain, require_choice
 from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install, say
@@ -68,7 +68,7 @@ def split_words(command: str, arguments: Sequence[str]) -> tuple[list[str], Dict
     Raises:
         ConfigError: a word begins like an option, or a key or value is unknown.
     """
-    overrides = [word for word in arguments if ("=" in word and not Path(word).exists()) or word in ("-m", "--multirun")]
+    overrides = [word for word in arguments if ("=" in word and not Path(word).exists()) or word in SWEEP_FLAGS]
     given = [word for word in arguments if word not in overrides]
     strange = next((word for word in given if word.startswith("-")), None)
     if strange is not None:

@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hood.app.common import GivenUpError, output_folder, prepare_folder
 from hood.app.notices import heard
-from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, _one_line, load_config, options, read_word
+from hood.app.settings.compose import CONFIG_FOLDER, SWEEP_FLAGS, ConfigError, load_config, one_line, options, read_word
 from hood.app.settings.overrides import parse, quoted, search_path
 from hood.app.train import Tick, is_finished, iterations_of, last_record, tell_iterations, train
 from hood.assets.files.atomic import is_occupied, occupy, write_atomically
@@ -40,7 +40,6 @@ from hood.plugins import config_folders
 from hood.training import distributed
 from hood.training.checkpoint import previous, reached
 
-FLAGS = ("-m", "--multirun")
 #: Runs of a sweep go there where no output is given.
 _FOLDER = "runs/sweep"
 #: In the folder of a run that could not be begun or finished: why.
@@ -71,7 +70,7 @@ class Swept:
 
 def is_sweep(words: Sequence[str]) -> bool:
     """Whether words of ``hood train`` ask for a sweep."""
-    return any(word in FLAGS for word in words)
+    return any(word in SWEEP_FLAGS for word in words)
 
 
 def hydra_of(command: str, words: Sequence[str], info: str | None = None) -> DictConfig:
@@ -102,7 +101,7 @@ def _in_one_line() -> Iterator[None]:
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"configuration: {_one_line(error)}") from error
+        raise ConfigError(f"configuration: {one_line(error)}") from error
 
 
 def run_sweep(words: Sequence[str]) -> Swept:
@@ -117,7 +116,7 @@ def run_sweep(words: Sequence[str]) -> Swept:
             raise GivenUpError
         raise ConfigError("-m: torchrun shares one training; leave it out, hydra/launcher=joblib runs several at a time")
     hydras = [word for word in words if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
-    fixed, swept, folder = _divided([word for word in words if word not in (*FLAGS, *hydras)])
+    fixed, swept, folder = _divided([word for word in words if word not in (*SWEEP_FLAGS, *hydras)])
     if not swept and not any(word.startswith("hydra/sweeper=") or "sweeper.params" in word for word in hydras):
         raise ConfigError("-m: no key has several values; write some, such as seed=0,1,2, or leave -m out")
     hydra = _hydra()
@@ -150,7 +149,7 @@ def _launched(hydra: Hydra, words: list[str], folder: Path) -> Swept:
     except Exception as error:  # of a launcher, as where the system killed a process of it
         if os.environ.get("HOOD_TRACEBACK"):
             raise
-        reason = f"the launcher gave up ({_one_line(error)}); the same command again goes on"
+        reason = f"the launcher gave up ({one_line(error)}); the same command again goes on"
     finally:
         _SWEEPING.discard(os.getpid())
     if isinstance(jobs, list):
@@ -194,8 +193,8 @@ def one_run(_: DictConfig) -> float:
         try:
             interrupted = _trained(words, folder)
         except Exception as error:
-            write_atomically(folder / REASON, f"{_one_line(error)}\n".encode())
-            log.error(_one_line(error), exc_info=not isinstance(error, (ValueError, OSError, ImportError)))
+            write_atomically(folder / REASON, f"{one_line(error)}\n".encode())
+            log.error(one_line(error), exc_info=not isinstance(error, (ValueError, OSError, ImportError)))
             return math.nan
     if _is_orphan():
         os._exit(130)  # it would begin the next one

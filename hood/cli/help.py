@@ -13,8 +13,18 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hood.app.common import split_words
-from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, load_config, notes, options, plain, read_word, shown
-from hood.app.sweep import FLAGS, hydra_of
+from hood.app.settings.compose import (
+    CONFIG_FOLDER,
+    SWEEP_FLAGS,
+    ConfigError,
+    load_config,
+    notes,
+    options,
+    plain,
+    read_word,
+    shown,
+)
+from hood.app.sweep import hydra_of
 from hood.assets.files import library
 
 _EXAMPLES = {
@@ -174,7 +184,7 @@ def answer(name: str, words: Sequence[str]) -> int:
     """
     asked, rest = _asked(words)
     hydras = [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
-    rest = [word for word in rest if word not in hydras and not (name == "train" and word in FLAGS)]
+    rest = [word for word in rest if word not in hydras and not (name == "train" and word in SWEEP_FLAGS)]
     if name in _BEFORE_KEYS:
         files = split_words(name, rest)[0]
         rest = [word for word in rest if word not in files]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -111,7 +112,8 @@ def reached(folder: Path) -> tuple[int, bool]:
         try:
             state = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
             iteration, behind = int(state["iteration"]), int(state["iteration"]) + int(state["earlier"])
-        except Exception:  # missing, cut or no checkpoint; resuming says which
+        except (OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, pickle.UnpicklingError):
+            # missing, cut or no checkpoint; resuming says which
             continue
         try:
             return iteration, int(read_header(folder / "model.safetensors")["iteration"]) == behind

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from hood.app.batch.engines import LOCAL, TORCHRUN, check_engine, run_engine, tells_user, usual_workers
+from hood.app.batch.engines import LOCAL, TORCHRUN, check_engine, run_engine, tells_user, workers_of
 from hood.app.batch.manifest import (
     DOUBTFUL,
     FAILED,
@@ -351,7 +351,7 @@ def _tell_plan(config: DictConfig, words: Sequence[str], rows: Sequence[DataRow]
     spent = [_cost_of(row, costs, measured) for row in rows]
     seconds = sum(cost.row_seconds + cost.frame_seconds * count for cost, count in zip(spent, frames, strict=True))
     size = sum(cost.row_bytes + cost.frame_bytes * count for cost, count in zip(spent, frames, strict=True))
-    workers = usual_workers() if config.workers is None else int(config.workers)
+    workers = workers_of(config)
     say(f"rows: {len(rows):,}" + (f", {done:,} of them done" if done else ""))
     say(f"frames: {sum(frames):,.0f}, {sum(frames) / len(rows):.0f} a row")
     side = f", {seconds / 3600 / workers:.3g} with {workers} processes" if str(config.engine) in (LOCAL, TORCHRUN) else ""

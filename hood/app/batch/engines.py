@@ -89,7 +89,7 @@ def run_engine(config: DictConfig, call: Call, rows: Sequence[DataRow], follow: 
         ConfigError: an engine that cannot begin.
     """
     engine = str(config.engine)
-    workers = usual_workers() if config.workers is None else int(config.workers)
+    workers = workers_of(config)
     if engine == LOCAL:
         Pool(call, rows, min(workers, len(rows))).work(follow)
     elif engine == TORCHRUN:
@@ -101,8 +101,10 @@ def run_engine(config: DictConfig, call: Call, rows: Sequence[DataRow], follow: 
         _run_slurm(config, call, rows, min(workers, len(rows)), follow)
 
 
-def usual_workers() -> int:
-    """Processors that this process may use."""
+def workers_of(config: DictConfig) -> int:
+    """How many processes work at once: as many as asked for, else one for each processor that this process may use."""
+    if config.workers is not None:
+        return int(config.workers)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -230,7 +232,7 @@ def _run_ray(config: DictConfig, call: Call, rows: Sequence[DataRow], follow: Fo
     quiet = {"log_to_driver": False, "include_dashboard": False, "logging_level": "ERROR"}
     given = {"address": str(config.cluster), "log_to_driver": False} if config.cluster is not None else quiet
     if config.cluster is None:
-        given |= {"num_cpus": usual_workers() if config.workers is None else int(config.workers)}
+        given |= {"num_cpus": workers_of(config)}
     try:
         ray.init(**given)
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:

@@ -40,10 +40,10 @@ _ABSENT = object()
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", ListConfig: "a list in brackets"}
 #: Characters of a comment that is repeated in a message; a longer one is read in --help.
 _SHORT_NOTE = 160
-#: Characters of a value that a message repeats at most.
-_BRIEF = 100
-#: Characters of a reason why something cannot be read.
-_REASON = 300
+#: Characters of a value, and of a reason why something cannot be read, that a message repeats at most.
+_BRIEF, _REASON = 100, 300
+#: Words with dashes that ask for a sweep.
+SWEEP_FLAGS = ("-m", "--multirun")
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means
 #: the network, unless another stepper is named.
 NETWORK_KEYS = ("checkpoint", "model", "precision", "kernels")
@@ -126,7 +126,7 @@ def _loaded(folder: Path, plugins_of: tuple[str, ...], name: str, overrides: tup
             OmegaConf.resolve(config)
             rename_targets(config)
         except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigError(f"configuration: {decoded_text(_one_line(error))}") from error
+            raise ConfigError(f"configuration: {decoded_text(one_line(error))}") from error
     OmegaConf.set_struct(config, True)
     _check_types(name, known, config, "")
     return config
@@ -169,7 +169,7 @@ def build(node: DictConfig | dict[str, Any], **extra: Any) -> Any:
         cause = error.__cause__ or error
         if isinstance(cause, (ValueError, OSError)):
             raise cause from error
-        raise ConfigError(f"configuration: {_one_line(cause)}") from error
+        raise ConfigError(f"configuration: {one_line(cause)}") from error
 
 
 def plain(node: Any) -> Any:
@@ -246,7 +246,7 @@ def with_words(config: DictConfig, words: Sequence[str]) -> DictConfig:
 
 
 def _check_override(name: str, text: str, defaults: DictConfig) -> tuple[str, Override]:
-    if text.split("=")[0] in ("-m", "--multirun"):
+    if text.split("=")[0] in SWEEP_FLAGS:
         raise ConfigError(f"{text!r}: only hood train has sweeps; {loop(name)}")
     if text.startswith("-"):
         word = text.lstrip("-") if "=" in text else "key=value"
@@ -446,5 +446,5 @@ def _allowed() -> tuple[str, ...]:
     return (*_TARGETS, *(f"{name}." for name in packages()))
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__

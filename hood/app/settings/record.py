@@ -14,7 +14,7 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hood.app.settings.compose import _REASON, ConfigError, _one_line, plain, shown
+from hood.app.settings.compose import _REASON, ConfigError, one_line, plain, shown
 from hood.app.settings.old_names import put_todays_keys, rename_targets
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
@@ -37,7 +37,7 @@ def read_record(path: Path) -> dict[str, Any]:
         _require_plain(text)
         record = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        reason = _one_line(error)[:_REASON]
+        reason = one_line(error)[:_REASON]
         raise ConfigError(f"{path}: not the record of a run ({reason}); use another output") from error
     if not isinstance(record, dict):
         raise ConfigError(f"{path}: not the record of a run (it holds no keys); use another output")
@@ -60,7 +60,7 @@ def read_words(path: Path) -> dict[str, str]:
         _require_plain(text)
         words = yaml.safe_load(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{path}: not the words of a run ({_one_line(error)[:_REASON]}); remove it") from error
+        raise ConfigError(f"{path}: not the words of a run ({one_line(error)[:_REASON]}); remove it") from error
     if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
         raise ConfigError(f"{path}: not the words of a run (no list of words); remove it")
     return {word.partition("=")[0]: word.partition("=")[2] for word in words}
