@@ -96,19 +96,27 @@ def make_row(call: Call, row: DataRow, claimed: bool = True) -> bool:
     Args:
         claimed: whether processes tell each other; False where something else sees to it that none has another's row.
     """
+    manifest = Manifest(call.folder, call.since)
     with _claim(call, row) if claimed else _alone() as attempt:
-        if attempt is None or claimed and any(line["row"] == row.name for line in Manifest(call.folder, call.since).new()):
+        if attempt is None or _has_line(manifest, row):
             return False
         if attempt > call.attempts:
             sentence = f"the process that made it was killed {call.attempts} times, as where memory is short"
             lose(call, row, sentence)
             return True
         try:
-            _append(call, _made(call, row, attempt))
+            line = _made(call, row, attempt)
+            if claimed or not _has_line(manifest, row):  # a process that a lost cluster has left behind makes the same
+                _append(call, line)
         except OSError as error:
             raise HopelessError from error
         gc.collect()  # tables of large meshes, in few objects
         return True
+
+
+def _has_line(manifest: Manifest, row: DataRow) -> bool:
+    """Whether the row has got a line since the last look, or since the call began."""
+    return any(line["row"] == row.name for line in manifest.new())
 
 
 def lose(call: Call, row: DataRow, sentence: str) -> None:

@@ -276,6 +276,21 @@ def test_a_row_whose_process_is_killed_each_time_fails(motions: Path) -> None:
     assert not work.make_row(Call(call.folder, (), 2, Manifest(call.folder).size()), row)
 
 
+def test_what_a_lost_cluster_goes_on_to_make_gets_no_second_line(motions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call, (row, *_) = Call(Path("out"), (), 2, 0), planned("motions=[plie]")
+    Path("out").mkdir()
+    line = {"row": row.name, "verdict": "sound", "settings": row.keys}
+
+    def made_by_two(*_: Any) -> dict[str, Any]:
+        Manifest(call.folder).append(line)  # the other process is first
+        return line
+
+    monkeypatch.setattr(work, "_made", made_by_two)
+    assert work.make_row(call, row, claimed=False)
+    assert not work.make_row(call, row, claimed=False)
+    assert len(Path("out/manifest.jsonl").read_text().splitlines()) == 1
+
+
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="ends a tree of processes by its group")
 def test_a_killed_call_goes_on_where_it_stopped(motions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole tree is killed while rows are made; afterwards each row is there once, with the bits of an undisturbed run."""
