@@ -28,7 +28,7 @@ from layer_scenes import SCENES  # type: ignore[attr-defined]  # mypy knows the 
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
-from hood.media.pieces import outfit_colours
+from hood.media.pieces import outfit_ranks, part_colour
 from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import BODY_COLOR, Picture, RenderMesh, contact_sheet, render_frame
 from hood.media.video import save_png
@@ -86,7 +86,7 @@ def picture(problem: StepProblem, pos: np.ndarray, camera: Camera) -> Picture:
     """The cloth at ``pos`` (V, 3) and what it falls on; pieces have colours of their own."""
     cloth, obstacle = problem.cloth, problem.step.obstacle
     faces = cloth.faces.numpy()
-    pieces = RenderMesh(pos, faces, outfit_colours("+", faces, len(pos)))
+    pieces = RenderMesh(pos, faces, [part_colour(rank) for rank in outfit_ranks("+", faces, len(pos)).tolist()])
     if obstacle is None or float(np.ptp(obstacle.pos.numpy()[:, 1])) == 0.0:  # a floor is drawn anyway
         return render_frame([pieces], camera, 320, 240, floor=0.0)
     solid = obstacle.pos.numpy()

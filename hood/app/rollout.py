@@ -30,6 +30,7 @@ from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, pla
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
+from hood.app.scene.fabrics import fabric_names
 from hood.app.scene.garments import describe_ease, summarise_ease
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
@@ -292,7 +293,10 @@ def _simulate_to_disk(
         attributes |= {"refine_mesh": int(config.refine_mesh), "simulated_vertices": finer.num_coarse}
     garment, riders = scene.garment, scene.garment.riders
     attributes |= riding_attributes(riders)
-    still = refined_still(still_of(garment, scene.fastening, scene.cloth), finer, garment.faces)
+    names, fabric = fabric_names(config, garment, scene.motion)
+    attributes["fabric_names"] = "+".join(names)
+    still = still_of(garment, scene.fastening, scene.cloth) | ({"fabric": fabric} if len(names) > 1 else {})
+    still = refined_still(still, finer, garment.faces)
     stored_rest = scene.cloth.rest_pos.cpu().numpy() if finer is None else finer.rest_pos
     writer = RolloutWriter(
         path,

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.formats.image import Texture
 from hood.media.colouring import colouring_of
-from hood.media.pieces import outfit_colours, pieces_of
+from hood.media.pieces import looks_of, pieces_of
 from hood.media.renderer.render import (
     BODY_COLOR,
     Camera,
@@ -76,9 +76,9 @@ class Film:
         self.data, self.width, self.height = data, width, height
         self.thinner = thinner
         self.colouring = colouring_of(data, colour, beside)
-        self._own_colour = outfit_colours(
-            str(data.attributes.get("garment", "")), data.cloth_faces, data.cloth_pos.shape[1], data.still.get("piece")
-        )
+        looks, number = looks_of(data)
+        self._own_colour = np.array([look.colour for look in looks])[number]
+        self._shine = np.array([(look.sheen, look.glint, look.fuzz) for look in looks])[number]
         self._prints = () if self.colouring else _prints(data, textures or {})
         # Without a body the camera looks at the cloth, as far as that is finite.
         shown = data.body_pos
@@ -108,8 +108,11 @@ class Film:
             shown_body = _beneath(body, self.data.body_faces, cloth, self.thinner) if thin else body
             meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR, behind=_BEHIND))
         if dressed:
-            shown = self._own_colour if self.colouring is None else self.colouring.colours(index)
-            meshes.append(RenderMesh(cloth, self.data.cloth_faces, shown, self._hem, prints=self._prints))
+            if self.colouring is None:
+                own = RenderMesh(cloth, self.data.cloth_faces, self._own_colour, self._hem, 0.0, self._prints, self._shine)
+            else:
+                own = RenderMesh(cloth, self.data.cloth_faces, self.colouring.colours(index), self._hem)
+            meshes.append(own)
         picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture

@@ -1,41 +1,83 @@
 """The garments in a rollout, one by one, with their texture coordinates.
 
-Colours that tell the garments of an outfit apart.
+Colours that tell the garments of an outfit apart, and how fabrics look.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from hood.media.renderer.render import GARMENT_COLOR
+from hood.media.renderer.render import FUZZ, GARMENT_COLOR, SHEEN
 from hood.mesh import topology
 from hood.rollouts.file.reader import RolloutData
+
+
+@dataclass(frozen=True)
+class FabricLook:
+    """How a fabric is drawn.
+
+    Args:
+        colour: sRGB, 0 to 1.
+        sheen: share of the key light that its broad highlight reflects, and ``glint`` its narrow one.
+        fuzz: share of the light that its fibres scatter where it is seen at a grazing angle.
+    """
+
+    colour: tuple[float, float, float] = GARMENT_COLOR
+    sheen: float = SHEEN
+    glint: float = 0.0
+    fuzz: float = FUZZ
+
+    @property
+    def roughness(self) -> float:
+        """Of a physically based material, from 0 to 1."""
+        return min(max(0.972 - 1.2 * self.sheen - 0.9 * self.glint, 0.2), 1.0)
+
+
+#: By the name of an option of ``material=``; the paper's default fabric and others look alike.
+LOOKS = {
+    "chiffon": FabricLook((0.90, 0.74, 0.74), 0.14, 0.0, 0.16),
+    "coated_nylon": FabricLook((0.85, 0.40, 0.14), 0.16, 0.30, 0.06),
+    "cotton_canvas": FabricLook((0.72, 0.64, 0.48), 0.01, 0.0, 0.08),
+    "cotton_jersey": FabricLook((0.55, 0.58, 0.60), 0.01, 0.0, 0.14),
+    "cotton_poplin": FabricLook((0.82, 0.86, 0.91), 0.03, 0.0, 0.06),
+    "denim": FabricLook((0.17, 0.24, 0.40), 0.01, 0.0, 0.07),
+    "denim_12oz": FabricLook((0.14, 0.19, 0.33), 0.01, 0.0, 0.07),
+    "double_knit": FabricLook((0.44, 0.15, 0.22), 0.02, 0.0, 0.14),
+    "jersey": FabricLook((0.42, 0.52, 0.48), 0.01, 0.0, 0.14),
+    "linen": FabricLook((0.77, 0.71, 0.57), 0.02, 0.0, 0.08),
+    "nappa_leather": FabricLook((0.20, 0.11, 0.08), 0.10, 0.22, 0.04),
+    "silk": FabricLook((0.66, 0.12, 0.20), 0.34, 0.10, 0.08),
+    "silk_crepe": FabricLook((0.10, 0.36, 0.34), 0.16, 0.0, 0.10),
+    "silk_habotai": FabricLook((0.84, 0.73, 0.52), 0.36, 0.12, 0.08),
+    "wool_felt": FabricLook((0.43, 0.42, 0.42), 0.0, 0.0, 0.26),
+    "wool_suiting": FabricLook((0.19, 0.20, 0.24), 0.03, 0.0, 0.14),
+}
+#: Of a garment of an outfit that has the fabric of an earlier one, this share of its colour is its own.
+_TOLD_APART = 0.5
 
 #: In their order; far from the body's colour and from each other, in lightness as well.
 _OTHERS = ((0.80, 0.45, 0.22), (0.30, 0.52, 0.34), (0.62, 0.28, 0.42), (0.86, 0.74, 0.38), (0.28, 0.26, 0.42))
 
 
-def outfit_colours(name: str, faces: np.ndarray, num_vertices: int, piece: np.ndarray | None = None) -> ArrayLike:
-    """sRGB, 0 to 1: one colour (3,) of a garment; (V, 3) of several, whose ``name`` joins theirs by ``+``.
+def outfit_ranks(name: str, faces: np.ndarray, num_vertices: int, piece: np.ndarray | None = None) -> np.ndarray:
+    """(V,) the number of the garment of an outfit, whose ``name`` joins theirs by ``+``, that a vertex belongs to.
 
     Args:
         faces: (F, 3).
         piece: (V,) garment that a vertex belongs to. None, as in older recordings: every connected component counts as one.
     """
     if piece is not None and piece.shape == (num_vertices,):
-        return np.array([part_colour(rank) for rank in np.unique(piece, return_inverse=True)[1].tolist()])
+        return np.unique(piece, return_inverse=True)[1].reshape(-1)
     if "+" not in name:
-        return GARMENT_COLOR
+        return np.zeros(num_vertices, dtype=np.int64)
     part = topology.connected_components(num_vertices, topology.unique_edges(faces))
     # By their first vertices: garments lie one after another. Vertices of no face are not drawn.
     order = {int(label): rank for rank, label in enumerate(dict.fromkeys(part[np.unique(faces)].tolist()))}
-    colours = np.array([GARMENT_COLOR, *_OTHERS])
-    return colours[[order.get(int(label), 0) % len(colours) for label in part]]
+    return np.array([order.get(int(label), 0) for label in part])
 
 
 def part_colour(rank: int) -> tuple[float, float, float]:
@@ -43,6 +85,30 @@ def part_colour(rank: int) -> tuple[float, float, float]:
     colours = (GARMENT_COLOR, *_OTHERS)
     red, green, blue = (float(channel) for channel in colours[rank % len(colours)])
     return red, green, blue
+
+
+def looks_of(data: RolloutData) -> tuple[list[FabricLook], np.ndarray]:
+    """Looks of the cloth of a rollout, and which of them a vertex (V,) has: by its fabric and its garment. Garments of the same
+    fabric differ in colour."""
+    count = data.cloth_pos.shape[1]
+    rank = outfit_ranks(str(data.attributes.get("garment", "")), data.cloth_faces, count, data.still.get("piece"))
+    names, fabric = str(data.attributes.get("fabric_names", "")).split("+"), data.still.get("fabric")
+    known = (
+        fabric is not None and fabric.shape == (count,) and fabric.min(initial=0) >= 0 and fabric.max(initial=0) < len(names)
+    )
+    of_vertex = fabric if known else np.zeros(count, dtype=np.int64)
+    pairs, number = np.unique(np.stack([rank, of_vertex], axis=1), axis=0, return_inverse=True)
+    looks, taken = [], set[str]()
+    for garment, own in pairs.tolist():
+        look, mine = LOOKS.get(names[own]), np.array(part_colour(garment))
+        if look is None:
+            looks.append(FabricLook(part_colour(garment)))
+            continue
+        told = _TOLD_APART if garment and names[own] in taken else 0.0
+        red, green, blue = ((1.0 - told) * np.array(look.colour) + told * mine).tolist()
+        looks.append(replace(look, colour=(red, green, blue)))
+        taken.add(names[own])
+    return looks, number.reshape(-1)
 
 
 @dataclass(frozen=True)

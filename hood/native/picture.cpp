@@ -31,7 +31,8 @@ struct Light {
 
 // As `SeenValues` of hood/media/renderer/raster.py: what is drawn, and from where.
 struct Seen {
-    const double *pos, *color, *normal, *screen, *depth;  // of vertices: (V, 3) three times, (V, 2) pixels, (V,) m
+    const double *pos, *color, *normal, *shine;           // (V, 3) of vertices
+    const double *screen, *depth;                         // (V, 2) pixels, (V,) m
     const double* hem;                                    // (V,) m from the next hem
     const int64_t* faces;                                 // (F, 3)
     const int32_t* face;                                  // (height, width) of each pixel, -1 where nothing is drawn
@@ -201,14 +202,15 @@ double sewn(double dist, double foot) {
     return 1.0 - 0.3 * edge - 0.35 * seam;
 }
 
-void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, double open, double* out) {
+void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, Vec shines, double open, double* out) {
     const Vec key = at(light.key, 0);
     const double diffuse = clip((dot(normal, key) + 0.25) / 1.25, 0.0, 1.0);
     const double shadow = (0.25 + 0.75 * lit_at(light, pos + 0.006 * normal, 0.9)) * (0.5 + 0.5 * open);
     const double fill = clip(dot(normal, at(light.fill, 0)), 0.0, 1.0);
     const double up = 0.5 + 0.5 * normal.y, facing = clip(dot(normal, view), 0.0, 1.0);
-    const double gloss = 0.06 * power_24(clip(dot(normal, unit(view + key)), 0.0, 1.0)) * shadow;
-    const double away = 1.0 - facing, shine = gloss + 0.10 * away * away * away * up, dim = 0.72 + 0.28 * facing;
+    const double broad = power_24(clip(dot(normal, unit(view + key)), 0.0, 1.0)), squared = broad * broad;
+    const double gloss = (shines.x * broad + shines.y * squared * squared) * shadow;
+    const double away = 1.0 - facing, shine = gloss + shines.z * away * away * away * up, dim = 0.72 + 0.28 * facing;
     const double own[3] = {color.x, color.y, color.z};
     for (int k = 0; k < 3; ++k) {
         const double around = fill * light.fill_color[k] + up * light.sky_color[k] + (1.0 - up) * light.bounce_color[k];
@@ -228,10 +230,11 @@ void shade_pixel(const Light& light, const Seen& seen, const float* depths, int6
     const double third = ((b[0] - a[0]) * py - (b[1] - a[1]) * px) / turned;
     double weight[3] = {1.0 - second - third, second, third}, sum = 0.0;
     for (int k = 0; k < 3; ++k) sum += weight[k] /= seen.depth[corner[k]];
-    Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0};
+    Vec pos{0, 0, 0}, color{0, 0, 0}, normal{0, 0, 0}, shines{0, 0, 0};
     double hem = 0.0;
     for (int k = 0; k < 3; ++k) {
         const double share = clip(weight[k] / sum, 0.0, 1.0);
+        shines = shines + share * at(seen.shine, corner[k]);
         pos = pos + share * at(seen.pos, corner[k]);
         color = color + share * at(seen.color, corner[k]);
         normal = normal + share * at(seen.normal, corner[k]);
@@ -244,7 +247,7 @@ void shade_pixel(const Light& light, const Seen& seen, const float* depths, int6
         color = seen.inside * color;
     }
     color = sewn(hem, 1.0 / (seen.focal * seen.nearness[pixel])) * color;
-    shade(light, pos, normal, unit(at(seen.eye, 0) - pos), color, openness(seen, depths, row, column, normal), out);
+    shade(light, pos, normal, unit(at(seen.eye, 0) - pos), color, shines, openness(seen, depths, row, column, normal), out);
 }
 
 }  // namespace

@@ -227,12 +227,13 @@ def ridden_faces(faces: np.ndarray, count: int, riders: Riders | None) -> np.nda
 
 
 def ridden_still(still: Mapping[str, np.ndarray], riders: Riders | None) -> dict[str, np.ndarray]:
-    """What a file holds of the cloth beside its mesh, for riders too: the garment that each is of, and its texture."""
+    """What a file holds of the cloth beside its mesh, for riders too: garment and fabric that each is of, and its texture."""
     found = dict(still)
     if riders is None:
         return found
-    if "piece" in found:
-        found["piece"] = np.concatenate([found["piece"], found["piece"][riders.first_anchor]])
+    for name in ("piece", "fabric"):
+        if name in found:
+            found[name] = np.concatenate([found[name], found[name][riders.first_anchor]])
     if "uv_faces" in found:
         own = np.zeros_like(riders.faces) if riders.uv_faces is None else riders.uv_faces
         found["uv_faces"] = np.concatenate([found["uv_faces"], own])

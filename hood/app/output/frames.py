@@ -196,8 +196,7 @@ def refined_still(still: dict[str, np.ndarray], finer: Subdivision | None, faces
     if finer is None:
         return still
     refined = {**still, "simulated_faces": faces}
-    if "piece" in still:
-        refined["piece"] = finer.marks(still["piece"])
+    refined |= {name: finer.marks(still[name]) for name in ("piece", "fabric") if name in still}
     if "uv" in still:
         refined["uv"], refined["uv_faces"] = finer.texture(still["uv"], still["uv_faces"])
     return refined

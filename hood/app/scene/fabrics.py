@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
-from hood.app.settings.compose import ConfigError, build, load_config, options, plain
+import numpy as np
+import yaml
+
+from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, options, plain
 from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import part_faces
 from hood.assets.material import Material, measured
 from hood.cloth.fabric import patchwork
+from hood.plugins import config_folders
 from hood.scene.body_motion.motion import BodyMotion, Motion
 
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
@@ -31,6 +37,35 @@ def fabric_of(config: Settings, garment: Garment, motion: Motion) -> Material:
     body = motion.body if isinstance(motion, BodyMotion) else None
     pieces = [(part_faces(part, garment, body), fabric) for part, fabric in parts.items()]
     return patchwork(material, pieces, garment.rest_pos, garment.faces, width)
+
+
+def fabric_names(config: Settings, garment: Garment, motion: Motion) -> tuple[list[str], np.ndarray]:
+    """What the fabrics of a garment are called: options of ``material=``, the most alike where some of their values were
+    changed, empty where none is alike; and (V,) which of them most faces of a vertex are of."""
+    names, number = [_most_alike(plain(config.material))], np.zeros(len(garment.faces), dtype=np.int64)
+    body = motion.body if isinstance(motion, BodyMotion) else None
+    for part, given in (plain(config.fabrics) or {}).items():
+        name = str(given if isinstance(given, str) else given.get("material", names[0]))
+        names += [] if name in names else [name]
+        number[part_faces(str(part), garment, body)] = names.index(name)
+    votes = np.zeros((len(garment.rest_pos), len(names)))
+    np.add.at(votes, (garment.faces, number[:, None]), 1.0)
+    return names, votes.argmax(axis=1)
+
+
+def _most_alike(material: Mapping[str, Any]) -> str:
+    def alike(name: str) -> int:
+        return sum(material.get(key) == value for key, value in _values(name).items())
+
+    best = max(options("material"), key=alike)
+    return best if 2 * alike(best) > len(material) else ""
+
+
+@cache
+def _values(name: str) -> dict[str, Any]:
+    """What the file of an option of ``material=`` says."""
+    files = [folder / "material" / f"{name}.yaml" for folder in (CONFIG_FOLDER, *config_folders())]
+    return dict(yaml.safe_load(next(file for file in files if file.exists()).read_text(encoding="utf-8")))
 
 
 def checked_fabrics(config: Settings) -> dict[str, Material]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.media.pieces import part_colour, pieces_of
+from hood.media.pieces import looks_of, pieces_of
 from hood.media.renderer.render import BODY_COLOR
 from hood.rollouts.file.reader import RolloutData
 
@@ -28,6 +28,7 @@ class ClipPart:
     uv: np.ndarray | None = None  # (U, 2)
     uv_faces: np.ndarray | None = None  # (F, 3), into uv
     texture: Texture | None = None
+    roughness: float = 0.9  # 0 to 1
 
     def normals(self, frame: int) -> np.ndarray:
         """Unit normals (V, 3) of one frame; of vertices without a face, or with faces of no area, any."""
@@ -93,14 +94,15 @@ def clip_of(
 
 
 def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) -> list[ClipPart]:
-    """One part a garment where the file says which vertex belongs to which."""
-    found = []
-    for rank, piece in enumerate(pieces_of(data)):
+    """One part a garment where the file says which vertex belongs to which; it looks like the fabric of most of it."""
+    found, (looks, look_of) = [], looks_of(data)
+    for piece in pieces_of(data):
         number = np.full(pos.shape[1], -1)
         number[piece.vertices] = np.arange(len(piece.vertices))
         faces, texture = number[data.cloth_faces[piece.faces]], textures.get(piece.name)
         own = pos[:, piece.vertices]
-        found.append(ClipPart(piece.name, own, faces, part_colour(rank), piece.uv, piece.uv_faces, texture))
+        look = looks[int(np.bincount(look_of[piece.vertices], minlength=1).argmax())]
+        found.append(ClipPart(piece.name, own, faces, look.colour, piece.uv, piece.uv_faces, texture, look.roughness))
     return found
 
 

@@ -54,7 +54,7 @@ def gltf_bytes(clip: Clip) -> bytes:
     for index, part in enumerate(clip.parts):
         meshes.append(_mesh(file, part, index))
         linear = [*(float(channel) ** 2.2 for channel in part.colour), 1.0]
-        surface: dict[str, Any] = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        surface: dict[str, Any] = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": part.roughness}
         if part.texture is not None:
             surface |= {"baseColorFactor": [1.0] * 4, "baseColorTexture": {"index": images.index(part.texture)}}
         materials.append({"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": part.name != "body"})
@@ -254,7 +254,7 @@ def _bind_image(stage: Any, clip: Clip, part: str, image: str) -> None:
     texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
     texture.CreateInput("st", kinds.Float2).ConnectToSource(reader.CreateOutput("result", kinds.Float2))
     surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("roughness", kinds.Float).Set(0.9)
+    surface.CreateInput("roughness", kinds.Float).Set(next(one.roughness for one in clip.parts if one.name == part))
     surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(texture.CreateOutput("rgb", kinds.Float3))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
     mesh = stage.GetPrimAtPath(f"/rollout/{part}")

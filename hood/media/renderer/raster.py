@@ -118,7 +118,7 @@ class SeenValues(ctypes.Structure):
     """``Seen`` of ``picture.cpp``."""
 
     _fields_ = [
-        *fields("pos color normal screen depth hem faces face nearness around axes own", POINTER),
+        *fields("pos color normal shine screen depth hem faces face nearness around axes own", POINTER),
         *fields("width height num_around", COUNT),
         ("eye", _TRIPLE),
         *fields("focal reach inside", REAL),

@@ -150,6 +150,8 @@ Picture = NDArray[np.uint8]
 
 BODY_COLOR = (0.74, 0.70, 0.66)
 GARMENT_COLOR = (0.20, 0.42, 0.66)
+#: Shares of the light in the broad highlight of a surface, and in what its fibres scatter where it is seen at a grazing angle.
+SHEEN, FUZZ = 0.06, 0.10
 
 _SUPERSAMPLING = 2
 #: Share of its colour that a face seen from inside shows.
@@ -162,7 +164,8 @@ class RenderMesh:
 
     Both sides are drawn; the side that faces against its normal is darker. `hem` (V,) [m] is the distance from the next
     hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
-    the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces.
+    the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces. `shine`, (3,) or
+    per vertex (V, 3): shares of the light in a broad and in a narrow highlight, and in what fibres scatter.
     """
 
     pos: ArrayLike
@@ -171,6 +174,7 @@ class RenderMesh:
     hem: ArrayLike | None = None
     behind: float = 0.0
     prints: Sequence[Print] = ()
+    shine: ArrayLike = (SHEEN, 0.0, FUZZ)
 
 
 def render_frame(
@@ -252,7 +256,7 @@ def _written(image: Picture, text: str, size: int, place: tuple[int, int], ancho
 def _join(meshes: Sequence[RenderMesh]) -> Surface:
     if not meshes:
         raise ValueError("render_frame: no meshes given; pass at least one RenderMesh")
-    parts: list[tuple[_Array, NDArray[np.int64], _Array, _Array, _Array, _Array]] = []
+    parts: list[tuple[_Array, NDArray[np.int64], _Array, _Array, _Array, _Array, _Array]] = []
     offset = 0
     for index, mesh in enumerate(meshes):
         pos, faces = np.asarray(mesh.pos, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
@@ -267,7 +271,8 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
         if hem.shape != (len(pos),):
             raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
         behind = np.full(len(pos), mesh.behind)
-        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind))
+        shine = np.broadcast_to(np.asarray(mesh.shine, dtype=np.float64), pos.shape)
+        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind, shine))
         offset += len(pos)
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -339,7 +344,8 @@ def _draw_surface(
     color = np.where(inside[:, None], _INSIDE * color, color)
     color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
     open_share = openness(view.buffer, view.focal, row, column, normal @ axes.T)
-    image[row, column] = light.shade(pos, normal, to_eye, color, open_share)
+    shine = _blend(weights, surface.shine, corners)
+    image[row, column] = light.shade(pos, normal, to_eye, color, shine, open_share)
     image[:] = np.where(view.buffer.face[..., None] >= 0, image.reshape(-1, 3)[view.first()], image)
 
 
@@ -353,7 +359,8 @@ def _seen_values(
         row, column, _, weights = view.covered()
         own = np.full((height, width, 3), np.nan)
         own[row, column] = printed(prints, view.number[view.buffer.face[row, column]], weights)
-    arrays = [packed(value) for value in (surface.pos, surface.color, surface.normal, view.screen, view.depth, surface.hem)]
+    seen = (surface.pos, surface.color, surface.normal, surface.shine, view.screen, view.depth, surface.hem)
+    arrays = [packed(value) for value in seen]
     arrays += [packed(view.faces, np.int64), packed(view.buffer.face, np.int32)]
     arrays += [packed(value) for value in (view.buffer.nearness, AROUND, camera.axes())] + ([] if own is None else [own])
     eye = tuple(float(value) for value in camera.position)

@@ -110,7 +110,8 @@ _BOUNCE = 0.18 * np.array([1.0, 0.97, 0.94])
 @dataclass(frozen=True)
 class Surface:
     """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3), distance from
-    the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m]."""
+    the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m], and how they `shine` (V, 3), as a
+    :class:`hood.media.renderer.render.RenderMesh`."""
 
     pos: _Array
     faces: _Faces
@@ -118,6 +119,7 @@ class Surface:
     normal: _Array
     hem: _Array
     behind: _Array
+    shine: _Array
 
 
 def _most_near(nearness: FloatArray) -> _Array:
@@ -181,10 +183,11 @@ class Light:
             shade += self._map[row, column] > bias - seen[:, 2]
         return 1.0 - shade / len(_PROBES)
 
-    def shade(self, pos: _Array, normal: _Array, view: _Array, color: _Array, openness: _Array) -> _Array:
+    def shade(self, pos: _Array, normal: _Array, view: _Array, color: _Array, shine: _Array, openness: _Array) -> _Array:
         """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours.
 
         Args:
+            shine: (P, 3) shares of the light in a broad and in a narrow highlight, and scattered at a grazing angle.
             openness: (P,) share of the light from all sides that is not kept off by what is near.
         """
         key = normal @ self.key
@@ -195,8 +198,9 @@ class Light:
         up = 0.5 + 0.5 * normal[:, 1]
         facing = np.clip(_dot(normal, view), 0.0, 1.0)
         half = unit(view + self.key)
-        gloss = 0.06 * np.clip(_dot(normal, half), 0.0, 1.0) ** 24 * shadow
-        rim = 0.10 * (1.0 - facing) ** 3 * up
+        broad = np.clip(_dot(normal, half), 0.0, 1.0) ** 24
+        gloss = (shine[:, 0] * broad + shine[:, 1] * broad**4) * shadow
+        rim = shine[:, 2] * (1.0 - facing) ** 3 * up
         around = fill[:, None] * _FILL + up[:, None] * _SKY + (1.0 - up)[:, None] * _BOUNCE
         received = (diffuse * shadow)[:, None] * _KEY + openness[:, None] * around
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]

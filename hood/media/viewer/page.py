@@ -21,7 +21,7 @@ import numpy as np
 from hood.assets.formats.image import Texture
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
-from hood.media.pieces import outfit_colours, pieces_of, split_seams
+from hood.media.pieces import looks_of, pieces_of, split_seams
 from hood.rollouts.file.reader import RolloutData
 from hood.scene.holding import first_step
 
@@ -213,10 +213,8 @@ def _scale(name: str, colouring: Colouring) -> dict[str, str]:
 def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], first: RolloutData | None) -> dict[str, Any]:
     """One rollout as JSON; its body is null where it is that of the first."""
     cloth, lost = _mesh(data.cloth_pos, data.cloth_faces)
-    garment = str(data.attributes.get("garment", ""))
-    faces, piece = np.asarray(data.cloth_faces, dtype=np.int64), data.still.get("piece")
-    fabric = outfit_colours(garment, faces, data.cloth_pos.shape[1], piece)
-    every = np.broadcast_to(np.asarray(fabric, dtype=np.float64), (data.cloth_pos.shape[1], 3))
+    looks, number = looks_of(data)
+    every = np.array([look.colour for look in looks])[number]
     same = first is not None and _same_body(first, data)
     return {
         "name": name,

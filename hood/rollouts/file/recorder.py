@@ -48,6 +48,7 @@ STILL = {
     "rest_length": np.float64,
     "simulated_faces": np.int32,
     "pinned": np.int32,
+    "fabric": np.int32,
 }
 
 
@@ -75,7 +76,8 @@ class RolloutWriter:
     given: texture coordinates ``cloth/uv (U,2)`` with ``cloth/uv_faces (F,3)``, which garment of an outfit a vertex belongs to,
     ``cloth/piece (V,)``, which vertices are held, ``cloth/pinned (P,)``, and pairs of vertices that are fastened to each other,
     ``cloth/fastened (A,2)``, with the number of their row and the distance [m] that they are held at, and of a garment that
-    has a flat pattern the lengths of its edges there, ``cloth/rest_length (E,)`` [m]; attributes:
+    has a flat pattern the lengths of its edges there, ``cloth/rest_length (E,)`` [m], and of several fabrics which of
+    the attribute ``fabric_names``, joined by ``+``, a vertex is of, ``cloth/fabric (V,)``; attributes:
     ``num_frames`` done so far of ``num_planned``, ``complete``, and what is given as ``attributes``. Real numbers are float32,
     positions far from the origin float64; with ``double`` the cloth's are float64 anyway, for states that meet an accuracy
     which float32 does not resolve.

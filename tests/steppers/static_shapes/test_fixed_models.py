@@ -88,7 +88,11 @@ def test_a_step_is_the_plain_one(name: str, skirt_scene: Scene, monkeypatch: pyt
     assert len(stepper._plans) == 1
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name not in ("small2", "small3")])  # small1 with other values
+#: Kinds whose steps are made of the others'.
+MIXED = ("physical", "local edges")
+
+
+@pytest.mark.parametrize("name", ["small1", "quickstart", pytest.param("small-ours", marks=pytest.mark.slow)])
 def test_nothing_in_a_step_depends_on_data(name: str, skirt_scene: Scene) -> None:
     """Tensors without values on a device other than the CPU: asking for a value, or for an array whose size follows from
     values, raises an error there, as does one tensor from the CPU."""
@@ -115,7 +119,7 @@ def make(kind: str) -> NetworkStepper:
     return build_simulator(features, output, schedule, latent_dim=16, output_init=0.3).eval()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in MIXED)) for kind in KINDS])
 @pytest.mark.parametrize("name", ["skirt_scene", pytest.param("tank_scene", marks=pytest.mark.slow)])
 def test_every_kind_of_model_has_such_a_step(kind: str, name: str, request: pytest.FixtureRequest) -> None:
     """With pins and without, with springs of buttons, and without a body."""
