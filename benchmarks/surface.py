@@ -27,8 +27,7 @@ from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.load import load_sequence
-from hood.contact.activation_distance import REACHES
-from hood.contact.sample_points import PLACES
+from hood.contact.sample_points import PLACES, REACHES
 from hood.energies.contact import SIDES
 from hood.energies.potential import Potential, default_potential
 from hood.energies.self_contact import LayerBarrier, for_networks

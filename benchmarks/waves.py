@@ -6,8 +6,9 @@
 γ after some iterations from the base of ``output=local_steps``, on states of the solver, median and worst. Directions: every
 vertex alone (local steps); all together, coupled by springs of one stiffness along the edges (a Sobolev gradient, as of
 projective dynamics), with what contact adds to the diagonal or without; all together by the potential's positive matrix
-(:mod:`hood.solver.vertex.cg_step`). Each is taken as far as the potential falls along it, or whole, and then out of the body;
-the solver's own iterations beside them, with their line search around the body. Before that the CPU time of every direction.
+(:mod:`hood.solver.vertex.block_jacobi`). Each is taken as far as the potential falls along it, or whole, and then out of the
+body; the solver's own iterations beside them, with their line search around the body.
+Before that the CPU time of every direction.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ found here, on its straight way in free flight, and matched as a second contact.
 Cloth that is held farther off where a step left its triangles in the skin.
 
 Contact acts at vertices, and how far off it holds them is an estimate of how deep the flat triangles between them chord error
-(:mod:`hood.contact.activation_distance`). Where cloth is heavy, very soft or coarse, or lands fast, the estimate can be too
+(:mod:`hood.contact.sample_points`). Where cloth is heavy, very soft or coarse, or lands fast, the estimate can be too
 small. Where a step has left triangles in the skin is known afterwards: their corners are held farther off, and the step is
 taken to its end again.
 

@@ -9,9 +9,8 @@ from typing import Any, ClassVar, NamedTuple, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-from hood.contact.activation_distance import REACHES, vertex_reach
 from hood.contact.contact import CentroidContact, Contact, LaggedContact, find_centroid_contact, find_lagged_contact
-from hood.contact.sample_points import PLACES, PointContact
+from hood.contact.sample_points import PLACES, REACHES, PointContact, vertex_reach
 from hood.energies.laws import contact_depth, contact_energy, contact_force
 from hood.energies.problem import StepProblem, dot_rows, sum_per_scene
 from hood.energies.term import Energy, Form, Passes, Role
@@ -23,7 +22,7 @@ Weighted = TypeVar("Weighted")
 
 def checked_contact(term: str, contact: str, reach: str, sides: str) -> tuple[str, str, str]:
     """``contact``, ``reach`` and ``sides`` of a term: of :data:`hood.contact.sample_points.PLACES`,
-    :data:`hood.contact.activation_distance.REACHES` and :data:`SIDES`.
+    :data:`hood.contact.sample_points.REACHES` and :data:`SIDES`.
 
     Raises:
         ValueError: they are not.
@@ -87,7 +86,7 @@ class Collision(Energy):
     Vertices without a match within the search's cap, and isolated ones, feel nothing.
 
     At vertices ε is ``epsilon`` and by ``reach=curvature`` the depth as well to which the skin would bulge through the flat
-    triangles between them (:func:`hood.contact.activation_distance.chord_error`). Like the correspondence it is found at t and
+    triangles between them (:func:`hood.contact.sample_points.chord_error`). Like the correspondence it is found at t and
     constant in the step.
 
     In folds of the body, as in the bend of an elbow, a vertex lies between two parts of the skin. By ``sides=both`` it is kept
@@ -103,7 +102,7 @@ class Collision(Energy):
         weight: w [J/m³].
         epsilon: least distance [m] at which the penalty sets in.
         contact: ``vertices``, ``edges`` or ``strict``, see :data:`hood.contact.sample_points.PLACES`.
-        reach: ``curvature`` or ``constant``, see :data:`hood.contact.activation_distance.REACHES`.
+        reach: ``curvature`` or ``constant``, see :data:`hood.contact.sample_points.REACHES`.
         sides: ``both`` or ``nearest``, see :data:`SIDES`.
     """
 

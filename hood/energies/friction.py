@@ -8,9 +8,8 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from hood.contact.activation_distance import vertex_reach
 from hood.contact.contact import Contact
-from hood.contact.sample_points import PointContact
+from hood.contact.sample_points import PointContact, vertex_reach
 from hood.energies.contact import checked_contact, contacts_of, lagged_contact, weighted, with_lagged_centroids, with_places
 from hood.energies.laws import lagged_contact_force, mollified_norm
 from hood.energies.problem import StepProblem, dot_rows, sum_per_scene

@@ -93,11 +93,9 @@ def looks_of(data: RolloutData) -> tuple[list[FabricLook], np.ndarray]:
     count = data.cloth_pos.shape[1]
     rank = outfit_ranks(str(data.attributes.get("garment", "")), data.cloth_faces, count, data.still.get("piece"))
     names, fabric = str(data.attributes.get("fabric_names", "")).split("+"), data.still.get("fabric")
-    known = (
-        fabric is not None and fabric.shape == (count,) and fabric.min(initial=0) >= 0 and fabric.max(initial=0) < len(names)
-    )
-    of_vertex = fabric if known else np.zeros(count, dtype=np.int64)
-    pairs, number = np.unique(np.stack([rank, of_vertex], axis=1), axis=0, return_inverse=True)
+    if fabric is None or fabric.shape != (count,) or not 0 <= fabric.min(initial=0) <= fabric.max(initial=0) < len(names):
+        fabric = np.zeros(count, dtype=np.int64)
+    pairs, number = np.unique(np.stack([rank, fabric], axis=1), axis=0, return_inverse=True)
     looks, taken = [], set[str]()
     for garment, own in pairs.tolist():
         look, mine = LOOKS.get(names[own]), np.array(part_colour(garment))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
-from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact, find_contact
+from hood.contact.sample_points import chord_error
 from hood.limits import STRAIN_START
 from hood.mesh.closest_point.vertices import nearest_centroids
 from hood.mesh.geometry import face_normals
@@ -36,7 +36,7 @@ def settle(
 ) -> Tensor:
     """Positions (V, 3) [m] near ``pos`` with bounded edge strain, at least ``clearance`` [m] outside the body, and
     where it bulges under long edges so far that these are outside as well
-    (:func:`hood.contact.activation_distance.chord_error`).
+    (:func:`hood.contact.sample_points.chord_error`).
 
     Skinning stretches loose cloth between the limbs and pushes cuffs into the skin; the first frame would then start with
     forces far beyond the weight. Alternates averaged edge-length projections (position based dynamics, Müller et al. 2007)

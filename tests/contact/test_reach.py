@@ -11,8 +11,8 @@ import torch
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, concatenate_obstacles
-from hood.contact.activation_distance import MOST_STRETCHED, chord_error, vertex_reach
 from hood.contact.contact import find_contact, find_fixed_contact
+from hood.contact.sample_points import MOST_STRETCHED, chord_error, vertex_reach
 from hood.energies.contact import Collision
 from hood.energies.friction import Friction
 from hood.energies.potential import coded_potential, default_potential, reference_potential

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from hood.assets.files.frame_rates import rates_in
 from hood.assets.files.guarded import first_line, own_dataset
 from hood.assets.files.library import SIZE_LIMIT, read_arrays
+from hood.assets.files.text import rates_in
 from hood.assets.formats.mesh_file import MeshFile, read_mesh, read_mesh_file
 from hood.assets.pickles.unpickle import load_pickle
 

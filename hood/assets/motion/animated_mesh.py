@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import parse_rate
 from hood.assets.files.library import DATA_FOLDER
 from hood.assets.files.said import Doubt
+from hood.assets.files.text import parse_rate
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
 from hood.assets.formats.mesh_file import object_alone, read_mesh_file, split_object

@@ -21,12 +21,10 @@ from typing import IO, Any, overload
 
 import numpy as np
 
-from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.library import DATA_FOLDER, locate, names, nearest
-from hood.assets.files.text import read_text
-from hood.assets.motion.layouts.content import ARRAYS, TENSORS
+from hood.assets.files.text import read_text, squeezed
+from hood.assets.motion.layouts.content import ARRAYS, TENSORS, WHOLE
 from hood.assets.motion.layouts.read import FRAME_IDS
-from hood.assets.motion.layouts.table import WHOLE
 from hood.assets.motion.recording import motion_suffixes
 from hood.assets.motion.sequence import PoseSequence
 

@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hood.assets.files.frame_rates import flat, parse_rate, rates_in
 from hood.assets.files.said import Doubt
-from hood.assets.motion.layouts.content import MOTION_SUFFIXES, motion_suffixes, read_content
+from hood.assets.files.text import flat, parse_rate, rates_in
+from hood.assets.motion.layouts.content import MOTION_SUFFIXES, VIDEO_FPS, MotionLayout, motion_suffixes, read_content
 from hood.assets.motion.layouts.people import Person, choose_person
 from hood.assets.motion.layouts.read import NUM_FINGER_JOINTS, Track, numbers, people_in, read_track
-from hood.assets.motion.layouts.table import VIDEO_FPS, MotionLayout
 from hood.assets.motion.skeleton import find_unit, joints_about_pelvis, spread, upright
 
 #: Rates [1/s] that are taken from a file.

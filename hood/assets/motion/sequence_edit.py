@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from hood.assets.files.guarded import check_size, guarded
 from hood.assets.files.library import npy_header
 from hood.assets.files.text import read_text
-from hood.assets.motion.layouts.table import WHOLE
+from hood.assets.motion.layouts.content import WHOLE
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.skeleton import from_vectors
 

@@ -51,8 +51,8 @@ class Inputs:
         residual: (V, 3) [m/s²] acceleration that the potential's gradient at the base asks for.
         local_step: (V, 3) [m] what every vertex alone would do about it, see :mod:`hood.solver.vertex.block_jacobi`.
         wide_residual: (V, 6) [m/s²] the residual of small and of large neighbourhoods, see :mod:`hood.model.features.local`.
-        global_step: (V, 3) [m] what all vertices together would do about it, see :mod:`hood.solver.vertex.cg_step`; None in
-            models that do not look at it.
+        global_step: (V, 3) [m] what all vertices together would do about it, see :mod:`hood.solver.vertex.block_jacobi`; None
+            in models that do not look at it.
         timestep: (B,) [s] value of the timestep feature; None for the step's dt. It is how the relaxing first step of
             a rollout is told to the network (paper, α in section 4.3).
         edge_rows: the table :attr:`edges` where it is known already; made or recognised from an earlier step otherwise.

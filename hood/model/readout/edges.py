@@ -36,8 +36,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hood.cloth.cloth import Cloth
-from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact
+from hood.contact.sample_points import chord_error
 from hood.energies.problem import StepProblem
 from hood.model.graph.builder import MESH, EdgeSet, Graph
 from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep

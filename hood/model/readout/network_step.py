@@ -21,7 +21,7 @@ from hood.model.features.local import WIDE_ROUNDS, Diffusion, look_local, neighb
 from hood.model.graph.builder import Graph
 from hood.model.network.model import MeshGraphNet
 from hood.native import features as native
-from hood.solver.vertex.cg_step import STEPS
+from hood.solver.vertex.block_jacobi import STEPS
 from hood.solver.vertex.compiled import local_terms
 from hood.tensors.conjugate_gradients import Steps
 

@@ -25,7 +25,7 @@ from hood.model.features.local import GLOBAL_LOOK_WIDTHS, LOOK_WIDTHS, neighbour
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass, take_passes
 from hood.native import features as native
-from hood.solver.vertex.cg_step import STEPS
+from hood.solver.vertex.block_jacobi import STEPS
 from hood.tensors.conjugate_gradients import Steps
 from hood.tensors.dense import RowSums
 

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.contact.activation_distance import chord_error
 from hood.contact.contact import Contact
+from hood.contact.sample_points import chord_error
 from hood.energies.compiled_elements import library
 from hood.energies.contact import Collision, Walls
 from hood.energies.friction import Friction, Grip, scaled_by_body_friction

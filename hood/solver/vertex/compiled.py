@@ -18,8 +18,7 @@ from hood.solver.compiled import newton
 from hood.solver.compiled.newton import compiled_step
 from hood.solver.compiled.system import CompiledScene
 from hood.solver.compiled.tables import build_tables
-from hood.solver.vertex.block_jacobi import LocalTerms, LocalView
-from hood.solver.vertex.cg_step import STEPS
+from hood.solver.vertex.block_jacobi import STEPS, LocalTerms, LocalView
 from hood.tensors.batch import made_of
 from hood.tensors.conjugate_gradients import Steps
 

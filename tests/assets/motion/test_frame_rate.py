@@ -12,8 +12,8 @@ from motion_kinds.parameters import amass, split
 from motion_kinds.published import aist, emdb, gvhmr, wham
 from motion_kinds.writers import write
 
-from hood.assets.files.frame_rates import parse_rate
 from hood.assets.files.said import Doubt
+from hood.assets.files.text import parse_rate
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.recording import read_recording
 

@@ -14,7 +14,7 @@ from test_output import ball_problem
 from torch import Tensor
 
 from hood.cloth.state import Attachments
-from hood.contact.activation_distance import chord_error
+from hood.contact.sample_points import chord_error
 from hood.energies.problem import StepProblem
 from hood.model.graph.builder import MESH, Graph, build_graph, build_static
 from hood.model.graph.hierarchy import build_hierarchy

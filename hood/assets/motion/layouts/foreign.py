@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import squeezed
 from hood.assets.files.guarded import listed
+from hood.assets.files.text import squeezed
 from hood.assets.motion.layouts.content import Unread
 from hood.assets.motion.layouts.people import Person
 from hood.assets.motion.skeleton import PARENTS

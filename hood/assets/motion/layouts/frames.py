@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import flat, squeezed
-from hood.assets.motion.layouts.content import length
+from hood.assets.files.text import flat, squeezed
+from hood.assets.motion.layouts.content import counts_of, find_layout, length
 from hood.assets.motion.layouts.rotations import as_turns
-from hood.assets.motion.layouts.table import counts_of, find_layout
 
 #: Names of frames: those of pictures, and numbers behind such a word.
 _FRAME_NAME = re.compile(r".*\.(jpe?g|png|bmp|webp)$|(frame|image|img)[_ -]?\d+$", re.IGNORECASE)

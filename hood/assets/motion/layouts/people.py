@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.frame_rates import flat, squeezed
 from hood.assets.files.guarded import listed
-from hood.assets.motion.layouts.content import Unread, length
-from hood.assets.motion.layouts.table import LAYOUTS, MotionLayout, find_layout, layout_sizes
+from hood.assets.files.text import flat, squeezed
+from hood.assets.motion.layouts.content import LAYOUTS, MotionLayout, Unread, find_layout, layout_sizes, length
 
 #: Entries of a list that are looked into.
 _MOST = 1000
