@@ -26,7 +26,7 @@ from hood.app.settings.rollout_settings import RolloutSettings, refinement
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import locate
-from hood.rollouts.verdict.rule import name_frames
+from hood.rollouts.verdict.frames import name_frames
 from hood.steppers.watched import PLAN_METRICS
 
 #: Words of these keys name files whose content decides.

@@ -14,7 +14,8 @@ import numpy as np
 
 from hood.limits import CUT_UNSOUND
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.rule import judge_rollout, worst_frame
+from hood.rollouts.verdict.frames import worst_frame
+from hood.rollouts.verdict.rule import judge_rollout
 
 #: A rollout that ran to its end and cannot be trusted.
 UNSOUND = 3

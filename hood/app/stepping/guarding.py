@@ -32,7 +32,7 @@ from hood.rollouts.checks.guard import (
 from hood.rollouts.checks.step_repair import LEFT, REFINED, SOLVED
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import RolloutWriter
-from hood.rollouts.verdict.rule import name_frames
+from hood.rollouts.verdict.frames import name_frames
 from hood.steppers.newton import Stepper
 
 OFF, REPAIR, STRICT = "off", "repair", "strict"

@@ -36,7 +36,8 @@ from hood.mesh.editing.quality import check_triangles
 from hood.mesh.editing.repair import Defects, find_defects
 from hood.mesh.topology import boundary_loops
 from hood.rollouts.file.reader import read_published, read_rollout
-from hood.rollouts.verdict.rule import judge_rollout, worst_frame
+from hood.rollouts.verdict.frames import worst_frame
+from hood.rollouts.verdict.rule import judge_rollout
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.mesh_motion import MeshMotion
 from hood.steppers import ranges

@@ -28,7 +28,7 @@ from hood.mesh.topology import unique_edges
 from hood.rollouts.checks.guard import CHECK, CUT, FORCE, INSIDE, STRAIN
 from hood.rollouts.checks.step_repair import LEFT, NOT_TRIED
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.rule import Cause, FoundFrames, mask_of, name_frames, standing_for
+from hood.rollouts.verdict.frames import Cause, FoundFrames, mask_of, name_frames, standing_for
 from hood.rollouts.verdict.skin import skin_causes
 from hood.rollouts.verdict.surface import Meshes, surface_metrics, visible, visible_crossings
 

@@ -29,7 +29,7 @@ from hood.limits import (
 from hood.mesh.penetration.compiled import eights
 from hood.mesh.penetration.crossing import self_crossings
 from hood.mesh.topology import connected_components, unique_edges
-from hood.rollouts.verdict.rule import mask_of, name_frames
+from hood.rollouts.verdict.frames import mask_of, name_frames
 from hood.scene.body_motion.motion import BodyMotion, Motion
 from hood.scene.jumps import describe_jumps, find_jumps
 

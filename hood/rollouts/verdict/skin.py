@@ -20,7 +20,7 @@ from hood.limits import (
 from hood.mesh.editing.repair import boundary_vertices
 from hood.mesh.penetration.crossing import Crossings, crossings
 from hood.mesh.topology import connected_components, hinges, unique_edges
-from hood.rollouts.verdict.rule import Cause, FoundFrames, name_frames, standing_for
+from hood.rollouts.verdict.frames import Cause, FoundFrames, name_frames, standing_for
 from hood.rollouts.verdict.surface import HARDLY, Meshes, in_folds, sampled, spread_over, visible
 
 #: Frames that are looked at from all sides, at most, of those in which the skin cuts the cloth.

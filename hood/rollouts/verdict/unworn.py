@@ -10,7 +10,7 @@ import numpy as np
 from hood.assets.files.said import Doubt
 from hood.limits import AWAY_UNSOUND, SHIFTED_UNSOUND, SLIPPED_UNSOUND, SUNK_SETTLING, SUNK_UNSOUND, TOLERATED
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.rule import Cause, FoundFrames
+from hood.rollouts.verdict.frames import Cause, FoundFrames
 from hood.rollouts.verdict.surface import Meshes
 from hood.rollouts.verdict.worn import Wear, measure_wear
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.rollouts.verdict.rule import name_frames, runs_of, worst_frame
+from hood.rollouts.verdict.frames import name_frames, runs_of, worst_frame
 
 
 def test_frames_in_words() -> None:
