@@ -20,12 +20,12 @@ import numpy as np
 
 from hood.assets.files.atomic import write_atomically
 from hood.limits import CUT_UNSOUND
+from hood.media.bars import paragraph, section, table, whole_page
 from hood.media.film import Film, sheet_frames
 from hood.media.renderer.render import contact_sheet
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.studies.envelope.judge import CLASSES, DEGRADED, FAILED, FIGURES, REFUSED, SILENT, SOUND, Criteria, Judged, shares
 from hood.studies.envelope.prose import ranges
-from hood.studies.page import paragraph, section, table, whole_page
 
 #: Pixels of a panel, of the gap between two and around them, and points of a curve at most.
 _WIDTH, _HEIGHT, _GAP, _EDGE, _POINTS = 320, 120, 56, 30, 120

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
-from hood.studies.page import paragraph, section, table, whole_page
+from hood.media.bars import paragraph, section, table, whole_page
 
 _STYLE = (
     "figure img { max-width: 100%; } dt { font-weight: 600; margin-top: .8em; } td { max-width: 34em; white-space: normal; }"

@@ -12,8 +12,7 @@ from hood.assets.files.atomic import write_atomically
 from hood.evaluation.bootstrap import DRAWS, LEVEL, Estimate
 from hood.evaluation.gap import AGREEMENT
 from hood.evaluation.table import NEWTON
-from hood.media.bars import write_png
-from hood.studies.page import paragraph, section, table, whole_page
+from hood.media.bars import paragraph, section, table, whole_page, write_png
 from hood.studies.tradeoff.charts import FLOOR, below_floor, cost_chart, front_chart, inline_svg, series_colours
 from hood.studies.tradeoff.comparison import (
     LEAST_ROLLOUTS,
