@@ -21,7 +21,7 @@ from hood.scene.scene import Scene
 from hood.solver.system.iterate import in_double, in_single
 from hood.solver.system.linear import block_product
 from hood.solver.system.plan import plan_for, quadratic_model
-from hood.solver.vertex import cg_step
+from hood.solver.vertex import block_jacobi
 from hood.solver.vertex.block_jacobi import LocalTerms
 from hood.solver.vertex.compiled import EngineTerms, local_terms
 from hood.tensors.batch import to_device
@@ -115,7 +115,7 @@ def test_partners_in_a_batch_change_nothing(compiled: bool, band_scene: Scene, t
     potential, scenes = default_potential(), (band_scene, tank_scene)
     singles = [problem_of(scene) for scene in scenes]
     counts = [scene.cloth.num_vertices for scene in scenes]
-    assert cg_step.STEPS(counts[0]) < cg_step.STEPS(counts[1])
+    assert block_jacobi.STEPS(counts[0]) < block_jacobi.STEPS(counts[1])
     together = StepProblem(
         concatenate_cloths([scene.cloth for scene in scenes]),
         concatenate_states([problem.state for problem, _ in singles]),
