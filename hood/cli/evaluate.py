@@ -233,7 +233,9 @@ class Plan:
         """What every garment, on all bodies, asks of a model."""
         config, potential, betas = self.config, build(self.config.losses), np.concatenate(self.shapes)
         cloths = {
-            name: build_cloth(garment.rest_pos, garment.faces, build(config.material), flat=garment.flat)
+            name: build_cloth(
+                garment.rest_pos, garment.faces, build(config.material), flat=garment.flat, made=garment.construction
+            )
             for name, garment in self.garments.items()
         }
         fps = float(config.fps)

@@ -18,7 +18,7 @@ from hood.assets.material import WEAVE, Material
 from hood.cloth.fabric import FabricMap
 from hood.mesh import geometry, topology
 from hood.mesh.editing.quality import check_triangles
-from hood.mesh.flat import edge_lengths, laid_out, rest_angles, rest_of
+from hood.mesh.flat import Construction, edge_lengths, laid_out, rest_angles, rest_of
 from hood.tensors.batch import concatenate, indexes
 from hood.tensors.dense import add_rows
 
@@ -179,6 +179,7 @@ def build_cloth(
     dtype: torch.dtype = torch.float32,
     uv: tuple[np.ndarray, np.ndarray] | None = None,
     flat: np.ndarray | None = None,
+    made: Construction | None = None,
 ) -> Cloth:
     """Cloth of one garment.
 
@@ -198,6 +199,7 @@ def build_cloth(
             one. None: see :func:`hood.cloth.cloth.grain_of`.
         flat: (F, 3, 2) [m], the corners of every face in the flat pattern, whose lengths, areas and angles are then those at
             rest; of faces of NaN those of ``rest_pos`` are. None: of all. The warp runs along its second axis.
+        made: its elastic, folds and layers; ``flat_rest`` leaves folds out.
 
     Raises:
         ValueError: the mesh cannot be simulated (see :func:`hood.mesh.editing.quality.check_triangles`), a fabric's field or
@@ -231,11 +233,19 @@ def build_cloth(
         "hinge_area": area[torch.as_tensor(hinge_table.faces)].sum(dim=1),
         "rest_angle": torch.zeros_like(angle) if flat_rest else angle,
     }
-    if flat is not None:
+    made = made or Construction()
+    if flat is not None or made.elastic is not None:
         shape = laid_out(pos, tri, flat)
-        real |= rest_of(shape, tri, hinges, density, len(points))
+        if made.elastic is not None:
+            shape, real["density"] = made.contracted(shape, density)
+        real |= rest_of(shape, tri, hinges, real["density"], len(points))
+    if flat is not None:
         real["rest_angle"] = torch.zeros_like(angle) if flat_rest else rest_angles(pos, hinges, hinge_table.faces, flat)
         uv = (flat.reshape(-1, 2), np.arange(flat[..., 0].size).reshape(-1, 3))
+    if made.fold is not None and not flat_rest:
+        real["rest_angle"] = made.rest_angles(real["rest_angle"], triangles, *hinge_table)
+    if made.bending is not None:
+        real["bending_stiffness"] *= torch.as_tensor(made.factors(triangles, *hinge_table))
     weave = np.stack([fabric.on_faces(name) for name in WEAVE], axis=1)
     if (weave != 1.0).any():
         grain = torch.as_tensor(grain_of(points, triangles, uv))

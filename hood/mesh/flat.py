@@ -1,9 +1,14 @@
 """Rest shapes that are flat patterns: every face has its own place in the plane, and need not fit its neighbours there.
 
 Along a seam the two faces of an edge may disagree about its length (gathers); the edge then counts as long as their mean.
+
+How cloth is made beyond its fabric and its lengths: elastic, folds, and the layers of seams and hems, as numbers of the sides
+of faces. Side k of a face is opposite to its corner k: it goes wherever its corner goes.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -109,7 +114,7 @@ def followed(flat: np.ndarray, faces: np.ndarray, before: np.ndarray, after: np.
     known = np.isfinite(edges).all(axis=(1, 2))
     # The turn from the face's frame to that of the pattern is the nearest rotation, or reflection, of what lays it there.
     left, _, right = np.linalg.svd(np.where(known[:, None, None], edges, old) @ np.linalg.inv(old))
-    turn, root = left @ right, _root(metric)
+    turn, root = left @ right, root_of(metric)
     moved = (turn @ root @ turn.transpose(0, 2, 1) @ edges).transpose(0, 2, 1) + flat[:, :1]
     result = flat.copy()
     result[:, 1:] = np.where((same | ~known)[:, None, None], flat[:, 1:], moved)
@@ -121,7 +126,110 @@ def _plane(pos: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return laid_out(torch.as_tensor(np.asarray(pos, np.float64)), torch.as_tensor(faces)).numpy().transpose(0, 2, 1)
 
 
-def _root(metric: np.ndarray) -> np.ndarray:
+def root_of(metric: np.ndarray) -> np.ndarray:
     """Square roots of symmetric matrices (F, 2, 2)."""
     values, vectors = np.linalg.eigh(metric)
     return np.asarray((vectors * np.sqrt(values)[:, None]) @ vectors.transpose(0, 2, 1))
+
+
+#: What is known of sides, and what says nothing of one.
+SIDES = {"elastic": 1.0, "fold": float("nan"), "bending": 1.0}
+
+
+@dataclass(frozen=True)
+class Construction:
+    """What is known of the sides of faces; None: nothing.
+
+    Args:
+        elastic: (F, 3) lengths at rest, in shares of those that the sides are cut at.
+        fold: (F, 3) rad, angles at rest across the sides; above 0 bends away from where the faces look. NaN: no fold.
+        bending: (F, 3) factors on the bending stiffness across the sides.
+    """
+
+    elastic: np.ndarray | None = None
+    fold: np.ndarray | None = None
+    bending: np.ndarray | None = None
+
+    def contracted(self, cut: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+        """Edges (F, 2, 2) [m] of the faces at rest, and densities (F,) [kg/m²] there: they weigh what they are cut with.
+
+        Args:
+            cut: edges x₁ - x₀ and x₂ - x₀ as rows, :func:`hood.mesh.flat.laid_out`.
+            density: kg/m² of what is cut.
+        """
+        assert self.elastic is not None
+        shape = torch.as_tensor(_contracted(cut.double().cpu().numpy(), self.elastic)).to(cut)
+        return shape, density * areas(cut) / areas(shape)
+
+    def rest_angles(self, angles: Tensor, faces: np.ndarray, hinges: np.ndarray, owners: np.ndarray) -> Tensor:
+        """``angles`` (H,) [rad] with those of folds in their places.
+
+        Args:
+            hinges: (H, 4), and ``owners`` (H, 2), of :func:`hood.mesh.topology.hinges`.
+        """
+        assert self.fold is not None
+        found = np.full(len(hinges), np.nan)
+        for place in (1, 0):  # of two faces that disagree the first counts
+            face, corner = owners[:, place], _corner(faces, owners[:, place], hinges[:, 2 + place])
+            # The angle of a hinge is seen from where its first face looks, if that goes from the edge's start to its end.
+            after = faces[face, (corner + 1) % 3] == hinges[:, place]
+            own = np.where(after, 1.0, -1.0) * self.fold[face, corner]
+            found = np.where(np.isnan(own), found, own)
+        folds = torch.as_tensor(found).to(angles)
+        return torch.where(torch.isnan(folds), angles, folds)
+
+    def turned(self, faces: np.ndarray) -> Construction:
+        """The same where ``faces`` (F,) bool have the other winding: the first corner is the last."""
+        tables = [None if table is None else np.where(faces[:, None], table[:, ::-1], table) for table in vars(self).values()]
+        if tables[1] is not None:
+            tables[1] = np.where(faces[:, None], -1.0, 1.0) * tables[1]
+        return Construction(*tables)
+
+    def factors(self, faces: np.ndarray, hinges: np.ndarray, owners: np.ndarray) -> np.ndarray:
+        """Factors (H,) on the bending stiffness, the mean of both faces'."""
+        assert self.bending is not None
+        both = [self.bending[owners[:, k], _corner(faces, owners[:, k], hinges[:, 2 + k])] for k in (0, 1)]
+        return np.asarray(0.5 * (both[0] + both[1]))
+
+
+def stretched_sides(edges: np.ndarray, axis: np.ndarray, along: float, across: float = 1.0) -> np.ndarray:
+    """Factors (F, 3) of the sides of faces that are ``along`` times as long in a direction, and ``across`` times in the other.
+
+    Args:
+        edges: (F, 2, 2) [m], edges x₁ - x₀ and x₂ - x₀ as rows.
+        axis: (F, 2) that direction in the same plane; of zero nothing changes.
+    """
+    length = np.linalg.norm(axis, axis=1, keepdims=True)
+    unit = axis / np.where(length > 0.0, length, 1.0)
+    normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    sides = _sides(edges)
+    parts = [factor * np.einsum("fkx,fx->fk", sides, way) for factor, way in ((along, unit), (across, normal))]
+    factor = np.hypot(*parts) / np.linalg.norm(sides, axis=2)
+    return np.where(length > 0.0, factor, 1.0)
+
+
+def no_triangles(lengths: np.ndarray) -> np.ndarray:
+    """(F,) bool: lengths (F, 3) of sides that make no triangle."""
+    a, b, c = np.square(lengths).T
+    return np.asarray(~(2.0 * (a * b + b * c + c * a) > a * a + b * b + c * c))
+
+
+def _corner(faces: np.ndarray, face: np.ndarray, vertex: np.ndarray) -> np.ndarray:
+    """Which corner (H,) of ``face`` (H,) ``vertex`` (H,) is."""
+    return np.asarray((faces[face] == vertex[:, None]).argmax(axis=1))
+
+
+def _sides(edges: np.ndarray) -> np.ndarray:
+    """(F, 3, 2): the sides opposite to corners 0, 1 and 2."""
+    return np.stack([edges[:, 1] - edges[:, 0], edges[:, 1], edges[:, 0]], axis=1)
+
+
+def _contracted(cut: np.ndarray, elastic: np.ndarray) -> np.ndarray:
+    """Edges (F, 2, 2) whose sides are ``elastic`` (F, 3) times as long, by a stretch without rotation."""
+    opposite, second, first = (np.square(elastic * np.linalg.norm(_sides(cut), axis=2))).T
+    mixed = 0.5 * (first + second - opposite)
+    gram = np.stack([first, mixed, mixed, second], axis=1).reshape(-1, 2, 2)
+    inverse = np.linalg.inv(cut)
+    metric = inverse @ gram @ inverse.transpose(0, 2, 1)
+    plain = (elastic == 1.0).all(axis=1)
+    return np.asarray(np.where(plain[:, None, None], cut, cut @ root_of(metric)))

@@ -127,8 +127,9 @@ def sew_around(sheet: PatternSheet, posed: PosedBody, material: Material, held: 
     moves = [np.array([0.0, lift, depth]) for depth in _DEPTHS for lift in _LIFTS]
     move = min(moves, key=lambda way: (len(crossings(pos + way, sheet.faces, thin, posed.faces).pairs), np.abs(way).sum()))
     pos = pos + move
-    held = waist_of(sheet, float(np.ptp(posed.surface[:, 1]))) if held is None else held
-    cloth = build_cloth(pos, sheet.faces, material, dtype=torch.float64, flat=sheet.flat)
+    held = waist_of(sheet, float(np.ptp(posed.surface[:, 1]))) & ~sheet.gathered if held is None else held
+    firm = sheet.stiffness
+    cloth = build_cloth(pos, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=sheet.flat, made=sheet.made)
     work = _Work(cloth, sheet.faces, posed, bones)
     here, drawn = work.draw_together(torch.as_tensor(pos))
     top = float(here[:, 1].max())

@@ -275,8 +275,10 @@ def dressed_scene(garment: Garment, motion: Motion, material: Material | None = 
     rest_pos = (motion.rest_pos(garment) if sizes.to_measure else garment.rest_pos) * np.array(sizes.start)
     uv = None if garment.uv is None or garment.uv_faces is None else (garment.uv, garment.uv_faces)
     flat = None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, rest_pos)
-    fabric, firm = material or Material(), garment.stiffness
-    cloth = build_cloth(rest_pos, garment.faces, fabric, garment.pinned, stiffness=firm, dtype=motion.dtype, uv=uv, flat=flat)
+    cloth = build_cloth(
+        rest_pos, garment.faces, material or Material(), garment.pinned,
+        stiffness=garment.stiffness, dtype=motion.dtype, uv=uv, flat=flat, made=garment.construction,
+    )  # fmt: skip
     cloth = to_device(cloth, motion.device)
     fastening = fastening_of(garment.fasteners, cloth.rest_pos)
     return Scene(cloth, garment, motion, 1.0 / motion.fps, sizes=sizes, fastening=fastening)

@@ -17,6 +17,9 @@ from hood.mesh.flat import followed, rest_of
 #: Sizes outside are no garment's.
 LEAST, MOST = 0.2, 5.0
 
+#: Rest angles within this [rad] of those of the rest shape follow it.
+_AS_DRAPED = 1e-2
+
 GarmentSize = float | Sequence[float]
 
 
@@ -94,9 +97,10 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
     if cloth.grain is not None:
         real["rest_inverse"] = along_grain(real["rest_inverse"], cloth.grain.double())
     if len(set(share.tolist())) > 1:
-        change = geometry.dihedral_angles(pos, hinges) - geometry.dihedral_angles(cloth.rest_pos.double(), hinges)
-        if cloth.flat is not None:  # a pattern stays flat
-            change = torch.where(cloth.rest_angle == 0.0, 0.0, change)
+        own = geometry.dihedral_angles(cloth.rest_pos.double(), hinges)
+        # A pattern stays flat, and folds keep their angles.
+        follows = ((cloth.rest_angle - own).abs() < _AS_DRAPED) & (cloth.rest_angle != 0.0)
+        change = torch.where(follows, geometry.dihedral_angles(pos, hinges) - own, 0.0)
         real["rest_angle"] = cloth.rest_angle.double() + change
     rounded: dict[str, Any] = {name: value.to(cloth.rest_pos.dtype) for name, value in real.items()}
     return replace(cloth, **rounded)

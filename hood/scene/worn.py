@@ -94,7 +94,8 @@ def put_on(garment: Garment, pos: np.ndarray, posed: PosedBody, clearance: float
     Pushing single vertices out of the body changes the edges between them; settling (:func:`hood.scene.start.settle`)
     spreads that over the cloth around.
     """
-    cloth = build_cloth(garment.rest_pos, garment.faces, Material(), dtype=torch.float64, flat=garment.flat)
+    flat, made = garment.flat, garment.construction
+    cloth = build_cloth(garment.rest_pos, garment.faces, Material(), dtype=torch.float64, flat=flat, made=made)
     surface, faces = torch.as_tensor(posed.surface), torch.as_tensor(posed.faces)
     scenes = [torch.zeros(len(table), dtype=torch.int64) for table in (surface, faces)]
     obstacle = Obstacle(surface, surface, surface, faces, *scenes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +11,18 @@ import torch
 from scipy import integrate, optimize
 
 from hood.assets.material import Material
+from hood.assets.pattern.making import sides_between
 from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles, concatenate_states
+from hood.contact.contact import Contact
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem, inertial_guess
+from hood.mesh.flat import Construction, laid_out, stretched_sides
+from hood.mesh.geometry import dihedral_angles, face_normals
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.step_figures import edge_strain
 from hood.steppers.newton import EulerStep, implicit_euler
-from hood.testing import Mesh, grid, make_problem, plane_contact, random_rotation, sphere
+from hood.testing import Mesh, cylinder, grid, make_problem, plane_contact, random_rotation, sphere
 
 F64 = torch.float64
 G = 9.81
@@ -153,6 +158,124 @@ def test_sliding_starts_at_the_angle_of_friction(coefficient, factor, beyond, me
         creep = term.slip_speed * (1.0 - np.sqrt(1.0 - np.tan(angle) / friction))
         assert speed < term.slip_speed
         assert speed == pytest.approx(creep, rel=1e-3)
+
+
+def ring(factor: float, density: float = 0.2, columns: int = 24, rows: int = 4) -> tuple[StepProblem, float, Callable]:
+    """A ring of cloth about the vertical, cut with the radius 0.12 m, 0.03 m high, with elastic ``factor`` around it. Its step,
+    its height, and the pull [N] of the whole ring at a radius: without λ it keeps its height, and h P = h μ (l³ - l)."""
+    pos, faces = cylinder(columns, rows, 0.12, 0.03)
+    material = Material(lame_mu=2e5, lame_lambda=0.0, density=density)
+    edges = laid_out(torch.as_tensor(pos), torch.as_tensor(faces)).numpy()
+    three = pos[faces][:, 1:] - pos[faces][:, :1]
+    level = np.cross([0.0, 1.0, 0.0], np.cross(three[:, 0], three[:, 1]))
+    shares = np.einsum("fxi,fx->fi", np.linalg.pinv(three), level)
+    ways = np.einsum("fi,fix->fx", shares, edges)
+    made = Construction(stretched_sides(edges, ways, factor))
+    cloth = build_cloth(pos, faces, material, dtype=F64, made=made)
+    problem = replace(make_problem(cloth), gravity=torch.tensor([0.0, -G, 0.0], dtype=F64))
+
+    def pull(radius: float) -> float:
+        stretch = radius / (0.12 * factor)
+        return 0.03 * material.thickness * material.lame_mu * (stretch**3 - stretch)
+
+    return problem, 0.03, pull
+
+
+def post(pos: torch.Tensor, radius: float) -> Contact:
+    """Contact with a vertical cylinder."""
+    dist = pos[:, [0, 2]].norm(dim=1)
+    normal = torch.stack([pos[:, 0] / dist, torch.zeros_like(dist), pos[:, 2] / dist], dim=1)
+    point = pos - (dist - radius)[:, None] * normal
+    plain = plane_contact(pos)
+    return replace(
+        plain,
+        dist=dist - radius,
+        vertex_dist=(dist - radius).abs(),
+        point=point,
+        normal=normal,
+        next_point=point,
+        next_normal=normal,
+    )
+
+
+def test_elastic_pulls_as_a_hoop_and_shrinks_to_its_length():
+    problem, _, pull = ring(0.8)
+    at = problem.state.pos.clone().requires_grad_()
+    default_potential().terms["stretching"](problem, at, torch.zeros_like(at)).sum().backward()
+    radial = (at.grad[:, [0, 2]] * at.detach()[:, [0, 2]]).sum(dim=1) / 0.12
+    # The forces of a hoop of 24 straight pieces: 2 T sin(π / 24) in every column.
+    assert float(radial.sum()) == pytest.approx(24 * 2.0 * pull(0.12) * np.sin(np.pi / 24), rel=1e-9)
+    assert float(at.grad[:, 1].abs().max()) < 1e-12
+    weight = float(problem.cloth.mass.sum())
+    assert weight == pytest.approx(0.2 * 0.03 * 24 * 2 * 0.12 * np.sin(np.pi / 24))  # of what was cut
+    free = replace(problem, gravity=torch.zeros(3, dtype=F64))
+    step = last(
+        implicit_euler(default_potential(), replace(free, step=replace(free.step, dt=torch.ones(1, dtype=F64))), 6, TIGHT)
+    )
+    torch.testing.assert_close(step.state.pos[:, [0, 2]].norm(dim=1), torch.full((96,), 0.096, dtype=F64), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("beyond", [0.9, 1.1])
+def test_elastic_holds_what_its_friction_carries(beyond):
+    """Around a post the ring presses with 2 π times its pull; it slides where its friction is below its weight."""
+    problem, _, pull = ring(0.8, density=8.0)
+    resting = replace(problem, gravity=torch.zeros(3, dtype=F64))
+    around = lambda _, state: post(state.pos, 0.12)  # noqa: E731
+    calm = last(implicit_euler(default_potential(friction_coefficient=0.0), resting, 30, TIGHT, contact=around)).state
+    radius = float(calm.pos[:, [0, 2]].norm(dim=1).mean())
+    weight = float(problem.cloth.mass.sum()) * G
+    critical = weight / (24 * 2.0 * pull(radius) * np.sin(np.pi / 24))
+    assert 0.1 < critical < 1.0
+    hung = replace(problem, state=replace(calm, vel=torch.zeros_like(calm.vel)))
+    potential = default_potential(friction_coefficient=beyond * critical)
+    state = last(implicit_euler(potential, hung, 15, TIGHT, contact=around)).state
+    speed, slow = -float(state.vel[:, 1].mean()), potential.terms["friction"].slip_speed
+    if beyond > 1.0:
+        assert speed == pytest.approx(slow * (1.0 - np.sqrt(1.0 - 1.0 / beyond)), rel=0.02)
+    else:
+        assert speed == pytest.approx(G * (1.0 - beyond) * 0.5, rel=0.05)
+
+
+def folded(angle: float, bending: float = 1.0) -> StepProblem:
+    """A flat strip of six rows, its first two held, with a fold across its middle."""
+    pos, faces = grid(7, 3, 0.3)
+    line = sides_between(faces, np.array([[9, 10], [10, 11]]))
+    made = Construction(None, np.where(line, angle, np.nan), np.where(line, bending, 1.0))
+    return make_problem(build_cloth(pos, faces, Material(), np.arange(len(pos)) < 6, dtype=F64, made=made))
+
+
+@pytest.mark.parametrize("angle", [-2.5, 0.7, 1.6, 3.0])
+def test_a_folded_strip_rests_at_its_angle(angle):
+    problem = folded(angle)
+    static = Potential({name: default_potential().terms[name] for name in ("stretching", "bending")})
+    start = problem.state.pos.clone()
+    pos, report = minimize(static, problem, start, NewtonSettings(target_rg=1e-11, linear="direct", max_iterations=400))
+    cloth = problem.cloth
+    found = dihedral_angles(pos, cloth.hinges)
+    torch.testing.assert_close(found, cloth.rest_angle, rtol=0, atol=1e-6)
+    assert set(cloth.rest_angle.abs().unique().tolist()) == {0.0, abs(angle)}
+    # Bends away from where the faces look: from above, as they are wound, the free end goes down.
+    up = face_normals(pos, cloth.faces[:1])[0]
+    tip = (pos[-1] - pos[9]) @ up
+    assert float(tip) * np.sign(angle) < 0.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 4.0])
+def test_a_seam_resists_by_its_factor(factor):
+    """The moment of a hinge, and how far a strip bends under a small weight."""
+    plain, stiff = folded(0.0), folded(0.0, factor)
+    on_seam = stiff.cloth.bending_stiffness / plain.cloth.bending_stiffness
+    assert set(on_seam.tolist()) == {1.0, factor}
+    pos, faces = grid(9, 3, 0.1)
+    sags = []
+    for made, stiffness in ((None, 1.0), (Construction(bending=np.full(faces.shape, factor)), 1.0), (None, factor)):
+        material = Material(bending_stiffness=stiffness * 4e-3)
+        cloth = build_cloth(pos, faces, material, np.arange(len(pos)) < 6, dtype=F64, made=made)
+        problem = replace(make_problem(cloth), gravity=torch.tensor([0.0, -1e-3, 0.0], dtype=F64))
+        static = Potential({name: term for name, term in default_potential().terms.items() if name != "inertia"})
+        sags.append(-float(minimize(static, problem, settings=TIGHT)[0][-1, 1]))
+    assert sags[0] == pytest.approx(factor * sags[1], rel=1e-3)
+    assert sags[1] == pytest.approx(sags[2], rel=1e-9)
 
 
 def draped(side: int, size: float, radius: float, subdivisions: int) -> StepProblem:

@@ -22,7 +22,7 @@ from hood.assets.fitting.placement import require_metres, used
 from hood.assets.fitting.suspicions import Suspicion, suspect_kind, suspect_seams
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
-from hood.assets.garment.parts import tailored
+from hood.assets.garment.parts import elasticated, tailored
 from hood.assets.garment.pins import pin_mask
 from hood.assets.garment.record import Wanted
 from hood.mesh.editing.repair import FLAT
@@ -201,13 +201,13 @@ def checked_sizes(config: Settings) -> Sizes:
     require_choice(config, "fit", FITS)
     if parts and end is not None:
         raise ConfigError(f"size_end={end}: parts of a garment keep their size; give size as one factor or three")
-    size = 1.0 if parts else plain(config.size)
+    size, factors = 1.0 if parts else plain(config.size), tuple(factor for own in parts.values() for factor in own.values())
     for key, value in (("size", size), ("size_end", size if end is None else end)):
         try:
-            sizes = replace(sizes_of(value), parts=tuple(parts.values()))
+            sizes = replace(sizes_of(value), parts=factors)
         except (ValueError, TypeError) as error:
             raise ConfigError(f"{key}={shown(config[key])}: {error}") from error
-    sizes = replace(sizes_of(size, end, seconds), parts=tuple(parts.values()))
+    sizes = replace(sizes_of(size, end, seconds), parts=factors)
     if sizes.changing and fixed_shapes(config):
         raise ConfigError(
             f"size_end={end}: step={config.step} has fixed shapes, which a garment that grows has not; use step=plain"
@@ -230,8 +230,8 @@ def _end_of(config: Settings) -> tuple[Any, float]:
     return value["size"], float(seconds)
 
 
-def checked_parts(config: Settings) -> dict[str, float]:
-    """Factors by part, where ``size`` is a table of them; empty where it is not.
+def checked_parts(config: Settings) -> dict[str, dict[str, float]]:
+    """What ``size`` says of parts, where it is a table of them: each with ``factor``, ``elastic`` or both; else empty.
 
     Raises:
         ConfigError: a factor that is no number.
@@ -239,23 +239,32 @@ def checked_parts(config: Settings) -> dict[str, float]:
     value = plain(config.size)
     if not isinstance(value, dict):
         return {}
-    for part, factor in value.items():
-        if isinstance(factor, bool) or not isinstance(factor, (int, float)):
-            raise ConfigError(f"size: {part} is {factor!r}; give a factor of the part, such as size={{{part}:1.1}}")
     if not value:
         raise ConfigError("size={}: names no part; give parts and factors, such as size={sleeves:1.2}, or one factor")
-    return {str(part): float(factor) for part, factor in value.items()}
+    parts = {str(part): own if isinstance(own, dict) else {"factor": own} for part, own in value.items()}
+    for part, own in parts.items():
+        if not own or not own.keys() <= {"factor", "elastic"}:
+            raise ConfigError(
+                f"size: {part} is {shown(value[part])}; give factor, elastic or both, {{{part}:{{elastic:0.85}}}}"
+            )
+        for key, factor in own.items():
+            if isinstance(factor, bool) or not isinstance(factor, (int, float)):
+                where = f"{part} is {factor!r}" if value[part] is factor else f"{key} of {part} is {factor!r}"
+                raise ConfigError(f"size: {where}; give a factor of the part, such as size={{{part}:1.1}}")
+    return {part: {key: float(factor) for key, factor in own.items()} for part, own in parts.items()}
 
 
 def cut_to_size(config: Settings, garment: Garment, motion: Motion) -> Garment:
-    """``garment`` with its parts cut as the config asks for, if it does.
+    """``garment`` with its parts cut, and drawn together, as the config asks for, if it does.
 
     Raises:
         ValueError: it names a part that the garment does not have.
     """
-    parts = checked_parts(config)
-    body = motion.body if isinstance(motion, BodyMotion) else None
-    return tailored(garment, parts, body) if parts else garment
+    parts, body = checked_parts(config), motion.body if isinstance(motion, BodyMotion) else None
+    for key, change in (("factor", tailored), ("elastic", elasticated)):
+        factors = {part: own[key] for part, own in parts.items() if key in own}
+        garment = change(garment, factors, body) if factors else garment
+    return garment
 
 
 def summarise_ease(first: Ease | None, last: Ease | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import SEAM, THREAD, Fitting, Wanted, own_names
 from hood.mesh.editing import repair
 from hood.mesh.editing.seams import Cut, Facing, Rims, Seam, along, along_corners, cut_edges, find_facing, find_rims
+from hood.mesh.flat import SIDES
 from hood.mesh.parts import MeshPart, find_parts, part_labels, rim_length
 from hood.mesh.topology import unique_edges
 
@@ -137,7 +138,8 @@ def _make_one(fitting: Fitting, garment: Garment, pairs: np.ndarray) -> None:
 
 
 def _with_cut(garment: Garment, cut: Cut) -> Garment:
-    """The garment with the new vertices; what its vertices and corners carry is linear along the edges."""
+    """The garment with the new vertices; what its vertices and corners carry is linear along the edges. Faces that are cut lose
+    what their sides carry."""
     rows: dict[str, Any] = {"rest_pos": along(cut, garment.rest_pos), "pinned": along(cut, garment.pinned)}
     if len(cut.ends):
         rows["region"] = None  # marks of the file's vertices
@@ -149,6 +151,10 @@ def _with_cut(garment: Garment, cut: Cut) -> Garment:
     if garment.flat is not None:
         corners, values = along_corners(cut, np.arange(3 * len(garment.flat)).reshape(-1, 3), garment.flat.reshape(-1, 2))
         rows["flat"] = values[corners]
+    whole = (cut.corners == np.arange(garment.faces.size).reshape(-1, 3)[cut.parent]).all(axis=1, keepdims=True)
+    for key, plain in SIDES.items():
+        if getattr(garment, key) is not None:
+            rows[key] = np.where(whole, getattr(garment, key)[cut.parent], plain)
     panels = {name: mask[cut.parent] for name, mask in (garment.panels or {}).items()} or None
     return replace(garment, **rows, faces=cut.faces, panels=panels, normal_faces=_corner_marks(garment, cut))
 

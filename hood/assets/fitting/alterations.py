@@ -16,6 +16,7 @@ from hood.assets.garment.record import Fitting
 from hood.mesh import topology
 from hood.mesh.editing import repair
 from hood.mesh.editing.repair import turn_caps
+from hood.mesh.flat import SIDES
 
 #: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
 _FARTHEST = 0.35
@@ -216,9 +217,9 @@ def join_short_edges(garment: Garment) -> tuple[Garment, int]:
 def turn_flat_faces(garment: Garment) -> tuple[Garment, int]:
     """Faces a corner of which lies on the opposite edge are divided anew with the face behind it; and how many there were.
 
-    Their stiffness across is without bounds. Vertices keep their numbers.
+    Their stiffness across is without bounds. Vertices keep their numbers. What has numbers of the sides of its faces stays.
     """
-    if garment.flat is not None:
+    if garment.flat is not None or any(getattr(garment, key) is not None for key in SIDES):
         return garment, 0
     corners, parent, count = turn_caps(garment.rest_pos, garment.faces)
     if not count:
@@ -259,7 +260,7 @@ _PER_VERTEX = (
     "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
     "thickness",
 )  # fmt: skip
-_PER_FACE = ("faces", "uv_faces", "normal_faces", "flat")
+_PER_FACE = ("faces", "uv_faces", "normal_faces", "flat", *SIDES)
 
 
 def keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:
@@ -284,4 +285,6 @@ def _turn_faces(garment: Garment, turned: np.ndarray) -> Garment:
     tables = {key: getattr(garment, key).copy() for key in _PER_FACE if getattr(garment, key) is not None}
     for table in tables.values():
         table[turned] = table[turned][:, ::-1]
+    if "fold" in tables:  # seen from the other side
+        tables["fold"][turned] *= -1.0
     return replace(garment, **tables)

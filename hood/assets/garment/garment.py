@@ -18,6 +18,7 @@ from hood.assets.garment.garment_arrays import as_arrays, checked_fields, read_f
 from hood.assets.garment.reference_garments import read_reference_garment
 from hood.assets.material import NO_GRADIENT
 from hood.mesh.editing.quality import check_triangles
+from hood.mesh.flat import Construction
 from hood.mesh.parts import Riders
 
 #: What can be given as a garment, besides embedded names and mesh files.
@@ -54,6 +55,9 @@ class Garment:
     )
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
     flat: np.ndarray | None = None  # (F, 3, 2) m, corners in the flat pattern: the cloth's lengths. NaN, None: as in rest_pos
+    elastic: np.ndarray | None = None  # (F, 3) sides at rest, shares of what they are cut at (:mod:`hood.mesh.flat`)
+    fold: np.ndarray | None = None  # (F, 3) rad, angles at rest across the sides opposite to the corners; NaN: no fold
+    bending: np.ndarray | None = None  # (F, 3) factors on the bending stiffness across these sides, of seams and hems; None: 1
     thickness: np.ndarray | None = None  # (V,) m, of the cloth as its file shows it; 0: not known. The fabric has its own
     riders: Riders | None = None  # buttons and the like, which ride on the cloth
     file_numbers: np.ndarray | None = None  # (V of the file,) present number of each of its vertices, -1: gone; None: as there
@@ -83,6 +87,11 @@ class Garment:
     def worn_pos(self) -> np.ndarray:
         """(V, 3) m: where it is worn, on the mean body in T-pose or in the first frame of a body without a skin."""
         return self.rest_pos if self.skin_pos is None else self.skin_pos
+
+    @property
+    def construction(self) -> Construction:
+        """What :func:`hood.cloth.cloth.build_cloth` is to know of elastic, folds and layers."""
+        return Construction(self.elastic, self.fold, self.bending)
 
     def shaped(self, betas: np.ndarray) -> np.ndarray:
         """Rest shape (V, 3) [m], grown with the body of shape ``betas``."""
@@ -256,4 +265,4 @@ def _same(given: Any, checked: Any) -> bool:
         return isinstance(given, tuple) and all(map(_same, given, checked))
     if not isinstance(given, np.ndarray) or given.dtype != checked.dtype:
         return False
-    return bool(np.allclose(given, checked, rtol=0.0, atol=_ROUNDING))
+    return bool(np.allclose(given, checked, rtol=0.0, atol=_ROUNDING, equal_nan=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.files.library import DATA_FOLDER, read_arrays
+from hood.mesh.flat import no_triangles
 from hood.mesh.parts import Riders
 
 #: Per-vertex fields and the shape of a row; None: any size.
@@ -28,6 +29,12 @@ _ROWS: dict[str, tuple[int | None, ...]] = {
     "thickness": (),
 }
 _CORNERS = ("uv_faces", "normal_faces")
+#: Numbers of the sides of faces, what they must be, and the test of it.
+_SIDES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "elastic": ("a share above 0, 1 for plain cloth", lambda value: np.isfinite(value) & (value > 0.0)),
+    "fold": ("an angle between -π and π, NaN for no fold", lambda value: np.isnan(value) | (np.abs(value) < np.pi)),
+    "bending": ("a factor above 0, 1 for plain cloth", lambda value: np.isfinite(value) & (value > 0.0)),
+}
 _LEVEL = "coarse_edges_"
 _FASTENER = "fastener_"
 _PANEL = "panel_"
@@ -94,6 +101,9 @@ def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, An
             fields[key] = _corner_table(where, key, arrays[key], fields)
     if "flat" in arrays:
         fields["flat"] = _flat(where, arrays["flat"], len(fields["faces"]))
+    for key in _SIDES:
+        if key in arrays:
+            fields[key] = _sides(where, key, arrays[key], fields)
     levels = sorted((key for key in arrays if key.startswith(_LEVEL)), key=lambda key: (len(key), key))
     if levels:
         fields["coarse_edges"] = tuple(_edge_table(where, key, arrays[key]) for key in levels)
@@ -261,6 +271,25 @@ def _flat(where: str, value: Any, num_faces: int) -> np.ndarray:
     if bad.any():
         raise ValueError(f"{where}: flat of face {int(bad.argmax())} is no triangle; repair it, or leave flat out")
     return flat
+
+
+def _sides(where: str, key: str, value: Any, fields: Mapping[str, Any]) -> np.ndarray:
+    """A number for every side of the faces."""
+    table, faces, (rule, fits) = _reals(where, key, value), fields["faces"], _SIDES[key]
+    if table.shape != faces.shape:
+        raise ValueError(f"{where}: {key} has shape {table.shape}; give a number for every side of the faces, {faces.shape}")
+    good = fits(table).all(axis=1)
+    if good.all() and key == "elastic":
+        rule, corners = "shares with which its sides still make a triangle", fields["rest_pos"][faces]
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=2)
+        if "flat" in fields:
+            cut = np.roll(fields["flat"], -1, axis=1) - np.roll(fields["flat"], -2, axis=1)
+            lengths = np.where(np.isnan(cut).any(axis=2), lengths, np.linalg.norm(cut, axis=2))
+        good = ~no_triangles(table * lengths) | (table == 1.0).all(axis=1)
+    if not good.all():
+        face = int(np.argmin(good))
+        raise ValueError(f"{where}: {key} of face {face} is {table[face].tolist()}; give {rule}, or leave {key} out")
+    return table
 
 
 def _corner_table(where: str, key: str, value: Any, fields: dict[str, Any]) -> np.ndarray:

@@ -8,6 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from hood.assets.garment.garment import Garment
+from hood.mesh.flat import SIDES
 from hood.mesh.parts import join_riders
 
 
@@ -47,7 +48,8 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         region=_join_rows(garments, "region", lambda garment: np.zeros(len(garment.rest_pos), dtype=np.int64)),
         fasteners=_join_fasteners(garments, starts),
         panels=_join_panels(garments),
-        flat=_join_flat(garments),
+        flat=_join_faces(garments, "flat", np.full((3, 2), np.nan)),  # those without keep the rest shape of their mesh
+        **{key: _join_faces(garments, key, np.full(3, plain)) for key, plain in SIDES.items()},
         thickness=_join_rows(garments, "thickness", lambda garment: np.zeros(len(garment.rest_pos))),
         riders=join_riders([garment.riders for garment in garments], starts.tolist(), _uv_starts(garments)),
         file_numbers=_join_numbers(garments, starts),
@@ -130,11 +132,14 @@ def _join_panels(garments: Sequence[Garment]) -> dict[str, np.ndarray] | None:
     return panels or None
 
 
-def _join_flat(garments: Sequence[Garment]) -> np.ndarray | None:
-    """Flat faces of those that have them; the others keep the rest shape of their mesh."""
-    if all(garment.flat is None for garment in garments):
+def _join_faces(garments: Sequence[Garment], key: str, default: np.ndarray) -> np.ndarray | None:
+    """A field of faces of all garments, ``default`` for every face of those without; None where no garment has it."""
+    tables = [getattr(garment, key) for garment in garments]
+    if all(table is None for table in tables):
         return None
-    return np.concatenate([np.full((len(g.faces), 3, 2), np.nan) if g.flat is None else g.flat for g in garments])
+    count = [len(garment.faces) for garment in garments]
+    rows = [np.broadcast_to(default, (size, *default.shape)) if t is None else t for size, t in zip(count, tables, strict=True)]
+    return np.concatenate(rows)
 
 
 def _free(name: str, taken: Mapping[str, np.ndarray]) -> str:

@@ -1,6 +1,7 @@
-"""Parts of a garment by name: panels, one of an outfit, sleeves, what is above or below a joint, colours, listed vertices.
+"""Parts of a garment by name: panels, one of an outfit, sleeves, what is above or below a joint, bands along openings, colours,
+listed vertices.
 
-Parts of a garment cut larger or smaller than the rest of it.
+Parts of a garment cut larger or smaller than the rest of it, or gathered by elastic.
 """
 
 from __future__ import annotations
@@ -10,16 +11,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy import sparse
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from hood.assets.body.body import JOINTS, Body
 from hood.assets.files.library import unknown
 from hood.assets.files.text import meant, read_indices
 from hood.assets.formats.image import read_texture
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.pins import REGIONS
-from hood.mesh.flat import followed
+from hood.assets.garment.pins import REGIONS, region_loop
+from hood.mesh.flat import followed, laid_out, stretched_sides
+from hood.mesh.parts import part_labels
 
 #: Colours of vertices that are names of parts.
 COLOURS = ("red", "green", "blue")
@@ -27,6 +31,8 @@ COLOURS = ("red", "green", "blue")
 SLEEVES = {"sleeves": ("left", "right"), "sleeve_left": ("left",), "sleeve_right": ("right",)}
 #: A vertex is of a colour that exceeds the two others by this much of the full scale.
 _STRENGTH = 0.5
+#: Faces whose centre is within this [m] of the rim of an opening are its band.
+BAND = 0.035
 
 
 def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
@@ -37,9 +43,9 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
         part: the name of a panel, as its file has it or folded (:mod:`hood.assets.files.text`), which counts before all else;
             likewise that of a garment of an outfit; ``above_JOINT`` or ``below_JOINT``, by the height of the centre in T-pose,
             the joint by its own name or that of an opening (:data:`hood.assets.garment.pins.REGIONS`); one of
-            :data:`SLEEVES`; one of :data:`COLOURS`, of the vertices in the mesh file; ``COLOUR@IMAGE``, where the centre of a
-            face lies on that colour of a PNG or JPEG file over the texture coordinates; or the path of a ``.txt`` or ``.json``
-            list of vertices.
+            :data:`SLEEVES`; an opening, for the band of :data:`BAND` along its rim; one of :data:`COLOURS`, of the vertices in
+            the mesh file; ``COLOUR@IMAGE``, where the centre of a face lies on that colour of a PNG or JPEG file over the
+            texture coordinates; or the path of a ``.txt`` or ``.json`` list of vertices.
         body: whose joints are meant, in T-pose; None refuses them.
 
     Raises:
@@ -51,6 +57,8 @@ def part_faces(part: str, garment: Garment, body: Body | None) -> np.ndarray:
         found = np.asarray(garment.panels[panel])
     elif part in SLEEVES:
         found = _sleeves(part, garment, body)
+    elif part in REGIONS:
+        found = _band(part, garment, body)
     elif side in ("above", "below") and joint:
         found = _beside(part, side, joint, garment, body)
     elif "@" in part:
@@ -70,7 +78,9 @@ def _piece(part: str, garment: Garment) -> np.ndarray:
     names = garment.name.split("+")
     piece = meant(part, names)
     if piece is None:
-        known = unknown("part", part, [*names, *(garment.panels or {}), "above_JOINT", "below_JOINT", *SLEEVES, *COLOURS])
+        known = unknown(
+            "part", part, [*names, *(garment.panels or {}), "above_JOINT", "below_JOINT", *SLEEVES, *REGIONS, *COLOURS]
+        )
         raise ValueError(f"garment {garment.name!r}: {known}; COLOUR@IMAGE, or a .txt or .json list of vertices")
     if garment.piece is None or len(names) == 1:
         return np.ones(len(garment.faces), dtype=bool)
@@ -110,6 +120,23 @@ def _joint(part: str, name: str, body: Body | None) -> np.ndarray:
     if JOINTS.index(name) >= len(joints):
         raise ValueError(f"part {part!r}: the body has {len(joints)} joints and no {name}; give another part")
     return np.asarray(joints[JOINTS.index(name)])
+
+
+def _band(part: str, garment: Garment, body: Body | None) -> np.ndarray:
+    """Near to the rim of an opening, in its piece of cloth."""
+    rim = _rim(part, garment, body)
+    share = np.linspace(0.0, 1.0, 8)[:, None, None]
+    points = ((1.0 - share) * rim + share * np.roll(rim, -1, axis=0)).reshape(-1, 3)
+    label = part_labels(len(garment.rest_pos), garment.faces)[garment.faces[:, 0]]
+    distance = cKDTree(points).query(_centres(garment))[0]
+    return np.asarray((distance < BAND) & (label == label[distance.argmin()]))
+
+
+def _rim(part: str, garment: Garment, body: Body | None) -> np.ndarray:
+    """(L, 3) m: the rim of an opening in T-pose."""
+    if body is None:
+        raise ValueError(f"part {part!r}: openings need a body with joints; give a list of vertices")
+    return np.asarray(garment.worn_pos[region_loop(garment, body, part, "part ")])
 
 
 def _listed(path: Path, garment: Garment) -> np.ndarray:
@@ -166,6 +193,8 @@ def _of_most_corners(inside: np.ndarray, garment: Garment) -> np.ndarray:
     return np.asarray(inside[garment.faces].sum(axis=1) >= 2)
 
 
+#: Faces with a smaller sine between their normal and an axis have no direction across it.
+_LEVEL = 0.1
 #: Weights of edges are cotangents, but for those of flat angles, which are at least this.
 _LEAST = 1e-3
 #: Pull of every vertex towards its place, as a share of the mean weight: it holds pieces of cloth where they are, no more.
@@ -194,6 +223,45 @@ def tailored(garment: Garment, factors: Mapping[str, float], body: Body | None =
         riders = replace(riders, pos=riders.positions(rest_pos, garment.rest_pos))
     flat = None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, rest_pos)
     return replace(garment, rest_pos=rest_pos, skin_pos=garment.worn_pos, riders=riders, flat=flat)
+
+
+def elasticated(garment: Garment, factors: Mapping[str, float], body: Body | None = None) -> Garment:
+    """The garment with parts that elastic draws together: shorter at rest by a factor, in one direction, than they are cut.
+
+    That direction runs along the rim of an opening; in a panel of a pattern along its x; in other parts level.
+
+    Args:
+        factors: by part (:func:`part_faces`); of parts that overlap the last counts.
+        body: as for :func:`tailored`.
+
+    Raises:
+        ValueError: a part that the garment does not have.
+    """
+    elastic = np.ones(garment.faces.shape) if garment.elastic is None else garment.elastic.copy()
+    edges = laid_out(torch.as_tensor(garment.rest_pos), torch.as_tensor(garment.faces), garment.flat).numpy()
+    for part, factor in factors.items():
+        mask, axis = part_faces(part, garment, body), np.array([0.0, 1.0, 0.0])
+        if part in REGIONS and part not in (garment.panels or {}):
+            rim = _rim(part, garment, body)
+            axis = np.cross(rim - rim.mean(axis=0), np.roll(rim, -1, axis=0) - rim.mean(axis=0)).sum(axis=0)
+        way = _across(garment, axis / np.linalg.norm(axis))
+        along = np.einsum("fi,fix->fx", way, edges)
+        if garment.flat is not None and part in (garment.panels or {}):
+            along[:] = [1.0, 0.0]
+        elastic[mask] = stretched_sides(edges, along, factor)[mask]
+    return replace(garment, elastic=elastic)
+
+
+def _across(garment: Garment, axis: np.ndarray) -> np.ndarray:
+    """(F, 2): the direction in every face, as worn, that is across ``axis`` (3,), as shares of its edges x₁ - x₀ and x₂ - x₀;
+    zero on faces that are almost across it as a whole."""
+    corners = garment.worn_pos[garment.faces]
+    edges = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    way = np.cross(axis, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    way[np.linalg.norm(way, axis=1) < _LEVEL] = 0.0
+    metric = np.einsum("fix,fjx->fij", edges, edges)
+    return np.asarray(np.linalg.solve(metric, np.einsum("fix,fx->fi", edges, way)[..., None])[..., 0])
 
 
 def lengths_of(before: Garment, after: Garment, part: str, body: Body | None = None) -> float:

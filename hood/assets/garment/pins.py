@@ -86,10 +86,11 @@ def _named(word: str, garment: Garment, body: Body | None) -> np.ndarray:
     return region_loop(garment, body, word)
 
 
-def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
+def region_loop(garment: Garment, body: Body, region: str, key: str = "pins=") -> np.ndarray:
     """Vertices of the opening (boundary loop) of ``garment`` nearest to the joint of ``region`` in T-pose.
 
-    Near means the loop's centre: an opening surrounds its joint. A waistband is above the hips, a hem below.
+    Near means the loop's centre: an opening surrounds its joint. A waistband is above the hips, a hem below. Messages begin
+    with ``key``.
 
     Raises:
         ValueError: the garment has no opening there, or the body no such joint.
@@ -97,11 +98,11 @@ def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
     joint = JOINTS.index(REGIONS.get(region, region))
     joints = body.shaped(np.zeros(0))[1]
     if joint >= len(joints):
-        raise ValueError(f"pins={region}: the body has {len(joints)} joints and no {JOINTS[joint]}; give vertex numbers")
+        raise ValueError(f"{key}{region}: the body has {len(joints)} joints and no {JOINTS[joint]}; give vertex numbers")
     pos = garment.worn_pos
     loops = topology.boundary_loops(garment.faces)
     if not loops:
-        raise ValueError(f"pins={region}: garment {garment.name!r} is closed, it has no openings; give vertex numbers")
+        raise ValueError(f"{key}{region}: garment {garment.name!r} is closed, it has no openings; give vertex numbers")
     centres = np.stack([pos[loop].mean(axis=0) for loop in loops])
     dist = np.linalg.norm(centres - joints[joint], axis=1)
     if region in _AT_THE_HIPS:
@@ -110,12 +111,12 @@ def region_loop(garment: Garment, body: Body, region: str) -> np.ndarray:
     if not np.isfinite(dist[nearest]):
         heights = ", ".join(f"{height:.2f}" for height in centres[:_MOST_HEIGHTS, 1])
         raise ValueError(
-            f"pins={region}: no opening of {garment.name!r} is a {region}: they are at the heights {heights} m, the hips "
+            f"{key}{region}: no opening of {garment.name!r} is a {region}: they are at the heights {heights} m, the hips "
             f"of the body at {joints[JOINTS.index('left_hip'), 1]:.2f} m; put the garment in place, or give vertex numbers"
         )
     if dist[nearest] > _REGION_REACH:
         raise ValueError(
-            f"pins={region}: the nearest of the {len(loops)} openings of {garment.name!r} is {dist[nearest]:.2f} m from "
+            f"{key}{region}: the nearest of the {len(loops)} openings of {garment.name!r} is {dist[nearest]:.2f} m from "
             f"the {JOINTS[joint].replace('_', ' ')}; give vertex numbers"
         )
     return loops[nearest]

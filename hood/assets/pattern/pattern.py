@@ -1,13 +1,16 @@
 """Sewing patterns in the format of GarmentCode (``specification.json``): flat panels, and which of their edges are sewn.
 
 Lengths are metres here, whatever the unit of the file; y is up, z forward, and the origin is on the floor under the body.
+
+A key ``hood`` of panels, edges and sides of stitches says how they are made, which the format has no words for: elastic, folds,
+and how stiff seams and hems are.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.files.guarded import check_size
+from hood.assets.pattern.making import EdgeMaking, Fold, edge_making, panel_making, stitch_making
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
 MOST_GATHERED = 4.0
@@ -39,6 +43,7 @@ class Edge:
     curve: np.ndarray
     arc: tuple[float, bool, bool] | None = None
     label: str = ""
+    making: EdgeMaking = EdgeMaking()
 
     def at(self, share: np.ndarray) -> np.ndarray:
         """Points (N, 2) [m] at shares (N,) of the parameter."""
@@ -71,10 +76,13 @@ class Edge:
 
     def evenly(self, count: int) -> np.ndarray:
         """Points (count + 1, 2) [m] at equal lengths along the side, its ends among them."""
-        fine = self.at(np.linspace(0.0, 1.0, 8 * max(count, _POINTS) + 1))
+        return self.along(np.linspace(0.0, 1.0, count + 1))
+
+    def along(self, shares: np.ndarray) -> np.ndarray:
+        """Points (N, 2) [m] at shares (N,) of the length."""
+        fine = self.at(np.linspace(0.0, 1.0, 8 * max(len(shares) - 1, _POINTS) + 1))
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
-        wanted = np.linspace(0.0, way[-1], count + 1)
-        return np.stack([np.interp(wanted, way, fine[:, axis]) for axis in (0, 1)], axis=1)
+        return np.stack([np.interp(way[-1] * shares, way, fine[:, axis]) for axis in (0, 1)], axis=1)
 
     @cached_property
     def length(self) -> float:
@@ -90,6 +98,7 @@ class PatternPanel:
         edges: one closed loop, in its order; ``numbers`` are theirs in the file.
         rotation: (3, 3).
         translation: (3,) m.
+        elastic: how many times as long it is at rest as it is cut, along x and along y.
     """
 
     name: str
@@ -98,6 +107,8 @@ class PatternPanel:
     rotation: np.ndarray
     translation: np.ndarray
     label: str = ""
+    elastic: tuple[float, float] = (1.0, 1.0)
+    folds: tuple[Fold, ...] = ()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) m in space of points (N, 2) of the panel."""
@@ -106,11 +117,15 @@ class PatternPanel:
 
 @dataclass(frozen=True)
 class Stitch:
-    """Two edges, as (panel, place in its loop), that are sewn; ``same``: they run in one direction, not against each other."""
+    """Two edges, as (panel, place in its loop), that are sewn; ``same``: they run in one direction, not against each other.
+    The cloth is folded there by ``angle`` [rad], seen from the first, where that is not None, and bends ``bending`` times as
+    stiffly."""
 
     first: tuple[str, int]
     second: tuple[str, int]
     same: bool = False
+    angle: float | None = None
+    bending: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -190,14 +205,16 @@ def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     edges, numbers = [], _loop(where, ends)
     for number in numbers:
         edge, there = own["edges"][number], f"{where}, edge {number}"
-        edges.append(_edge(there, edge, vertices[ends[number][0]], vertices[ends[number][1]], scale))
+        plain = _edge(there, edge, *vertices[list(ends[number])], scale)
+        edges.append(replace(plain, making=edge_making(there, edge, scale)))
         if edges[-1].length < _SHORTEST:
             raise ValueError(f"{there} has no length; merge its two vertices")
     _check_outline(where, edges, numbers)
     angles = _numbers(f"{where}: rotation", own.get("rotation", [0, 0, 0]), (3,))
     turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     translation = scale * _numbers(f"{where}: translation", own.get("translation", [0, 0, 0]), (3,))
-    return PatternPanel(name, tuple(edges), tuple(numbers), turn, translation, str(own.get("label", "")))
+    elastic, folds = panel_making(where, own, scale)
+    return PatternPanel(name, tuple(edges), tuple(numbers), turn, translation, str(own.get("label", "")), elastic, folds)
 
 
 def _loop(where: str, ends: list[tuple[int, int]]) -> list[int]:
@@ -265,7 +282,7 @@ def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel]) -> Stitch:
         raise ValueError(f"{where} is no pair of sides; write [{{panel, edge}}, {{panel, edge}}]")
     if len(own) == 3 and own[2] != "right_wrong":
         raise ValueError(f'{where}: its third entry is {own[2]!r}; write "right_wrong", or leave it out')
-    sides = []
+    sides: list[tuple[str, int]] = []
     for side in own[:2]:
         name, number = side.get("panel"), side.get("edge")
         if name not in panels:
@@ -276,7 +293,7 @@ def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel]) -> Stitch:
                 f"{where}: panel {name!r} has no edge {number}; remove the stitch, or give one of 0 to {count - 1}"
             )
         sides.append((str(name), panels[name].numbers.index(number)))
-    return Stitch(sides[0], sides[1], len(own) == 3)
+    return Stitch(sides[0], sides[1], len(own) == 3, *stitch_making(where, own[0], own[1]))
 
 
 def _check_stitches(where: str, pattern: Pattern, most: float) -> None:

@@ -9,11 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
+from hood.assets.pattern.making import construction_of
 from hood.assets.pattern.pattern import Pattern, PatternPanel
 from hood.mesh import topology
+from hood.mesh.flat import Construction
 
 #: Points inside a panel keep this share of the edge length from its outline.
 _FROM_OUTLINE = 0.6
+#: An end of a fold within this [m] of the outline is on it, and within this share of the edge length of a corner in that;
+#: points of a side that tell where it is.
+_ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
 
@@ -29,6 +34,8 @@ class PatternSheet:
         panels: (F,) bool each.
         seam: (V,) bool, vertices of a stitch.
         edge_labels: (V,) bool by label of an edge, the vertices along it.
+        made: its elastic, its folds and how stiff its seams and hems are.
+        stiffness: (V,) how many times as stiff as the fabric the cloth is; None: once.
     """
 
     pos: np.ndarray
@@ -38,29 +45,43 @@ class PatternSheet:
     panels: Mapping[str, np.ndarray]
     seam: np.ndarray
     edge_labels: Mapping[str, np.ndarray]
+    made: Construction = Construction()
+    stiffness: np.ndarray | None = None
 
     @property
     def flat(self) -> np.ndarray:
         """(F, 3, 2) m: corners of every face in the pattern."""
         return np.asarray(self.uv[self.uv_faces])
 
+    @property
+    def gathered(self) -> np.ndarray:
+        """(V,) bool: vertices of faces with elastic."""
+        found = np.zeros(len(self.pos), dtype=bool)
+        if self.made.elastic is not None:
+            found[self.faces[(self.made.elastic != 1.0).any(axis=1)]] = True
+        return found
+
 
 def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     """The pattern meshed with edges of about ``edge`` [m], sewn.
 
-    The two sides of a stitch have as many vertices, at equal shares of their lengths: gathers are spread evenly.
+    The two sides of a stitch have as many vertices, at equal shares of their lengths: gathers are spread evenly. Edges lie
+    along folds.
 
     Raises:
         ValueError: a panel that cannot be meshed so, or stitches that do not make a sheet of cloth; names ``where``, the panel
             and the repair.
     """
-    counts = _divisions(pattern, edge)
-    tables, faces, outlines, start = [], [], {}, 0
+    ends = {panel.name: _fold_ends(panel, edge) for panel in pattern.panels.values()}
+    shares = _divisions(pattern, edge, ends)
+    tables, faces, outlines, creases, start = [], [], {}, {}, 0
     placed, owner = [], []
     labels: dict[str, list[np.ndarray]] = {}
     at = 0.0
     for number, panel in enumerate(pattern.panels.values()):
-        points, triangles, sides = _meshed(panel, [counts[panel.name, k] for k in range(len(panel.edges))], edge, where)
+        own = [shares[panel.name, k] for k in range(len(panel.edges))]
+        points, triangles, sides, lines = _meshed(panel, own, ends[panel.name], edge, where)
+        creases[panel.name] = [start + line for line in lines]
         for k, side in enumerate(sides):
             outlines[panel.name, k] = start + side
             if panel.edges[k].label:
@@ -83,41 +104,90 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     count = np.bincount(welds)
     middle = np.stack([np.bincount(welds, pos[:, axis]) for axis in range(3)], axis=1) / count[:, None]
     names, welded = list(pattern.panels), welds[corners]
+    made = construction_of(pattern, corners, np.concatenate(tables), of_panel, outlines, creases)
     _check_sheet(welded, of_panel, names, where)
     turned = _turned(welded, of_panel, len(names))
     welded[turned], corners[turned] = welded[turned][:, ::-1], corners[turned][:, ::-1]
+    made = made.turned(turned)
     seam = np.zeros(len(count), dtype=bool)
     seam[welds[joined.reshape(-1)]] = True
     marks = {}
     for name, sides in labels.items():
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
-    own = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(middle, welded, np.concatenate(tables), corners, own, seam, marks)
+    parts = {name: of_panel == index for index, name in enumerate(names)}
+    return PatternSheet(middle, welded, np.concatenate(tables), corners, parts, seam, marks, made)
 
 
-def _divisions(pattern: Pattern, edge: float) -> dict[tuple[str, int], int]:
-    """Into how many edges each side of a panel is divided: sewn sides as the longer one asks for."""
-    counts = {
-        (name, k): max(round(side.length / edge), 1)
-        for name, panel in pattern.panels.items()
-        for k, side in enumerate(panel.edges)
-    }
+#: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.
+_Place = tuple[int, float] | None
+
+
+def _fold_ends(panel: PatternPanel, edge: float) -> list[tuple[_Place, _Place]]:
+    """Where the folds of a panel begin and end; what is near to a corner of the outline ends in it."""
+    places: list[_Place] = []
+    shares = np.linspace(0.0, 1.0, _FINE)
+    for point in [end for fold in panel.folds for end in (fold.start, fold.end)]:
+        place: _Place = None
+        nearest = _ON_OUTLINE
+        for k, side in enumerate(panel.edges):
+            line = side.along(shares)
+            way = np.diff(line, axis=0)
+            along = np.clip(((point - line[:-1]) * way).sum(axis=1) / (way * way).sum(axis=1), 0.0, 1.0)
+            distance = np.linalg.norm(line[:-1] + along[:, None] * way - point, axis=1)
+            at = int(distance.argmin())
+            if distance[at] < nearest:
+                share, near = (at + float(along[at])) / (_FINE - 1), _AT_CORNER * edge / side.length
+                place = k, 0.0 if share < near else 1.0 if share > 1.0 - near else share
+                nearest = float(distance[at])
+        places.append(place)
+    return list(zip(places[::2], places[1::2], strict=True))
+
+
+def _divisions(
+    pattern: Pattern, edge: float, ends: Mapping[str, list[tuple[_Place, _Place]]]
+) -> dict[tuple[str, int], np.ndarray]:
+    """Shares of the length of each side of a panel at which it has vertices, 0 and 1 among them: sewn sides are divided alike,
+    as the longer one asks for, and where folds end there is one."""
+    sides = {(name, k): side for name, panel in pattern.panels.items() for k, side in enumerate(panel.edges)}
+    at: dict[tuple[str, int], set[float]] = {key: {0.0, 1.0} for key in sides}
+    for name, places in ends.items():
+        for place in (place for pair in places for place in pair if place is not None):
+            at[name, place[0]].add(place[1])
+    lengths, least = {key: side.length for key, side in sides.items()}, dict.fromkeys(sides, 1)
     for stitch in pattern.stitches:
-        most = max(counts[stitch.first], counts[stitch.second])
+        first, second = stitch.first, stitch.second
+        both = at[first] | (at[second] if stitch.same else {1.0 - share for share in at[second]})
+        at[first], at[second] = both, both if stitch.same else {1.0 - share for share in both}
+        lengths[first] = lengths[second] = max(lengths[first], lengths[second])
         # A dart of one edge a side would fold its panel onto itself.
-        counts[stitch.first] = counts[stitch.second] = max(most, 2 if stitch.first[0] == stitch.second[0] else 1)
-    return counts
+        least[first] = least[second] = 2 if first[0] == second[0] else 1
+    found = {}
+    for key, shares in at.items():
+        steps = np.unique(np.round(sorted(shares), 9))
+        parts = np.maximum(
+            np.round(np.diff(steps) * lengths[key] / edge).astype(np.int64), least[key] if len(steps) == 2 else 1
+        )
+        inner = [np.linspace(low, high, n + 1)[:-1] for low, high, n in zip(steps[:-1], steps[1:], parts, strict=True)]
+        found[key] = np.append(np.concatenate(inner), 1.0)
+    return found
 
 
-def _meshed(panel: PatternPanel, counts: list[int], edge: float, where: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Points (N, 2) [m] of a panel, its triangles along the outline's way, and the points of every side, ends included."""
-    lines = [side.evenly(count)[:-1] for side, count in zip(panel.edges, counts, strict=True)]
+def _meshed(
+    panel: PatternPanel, shares: list[np.ndarray], ends: list[tuple[_Place, _Place]], edge: float, where: str
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Points (N, 2) [m] of a panel, its triangles along the outline's way, and the points of every side and fold, ends
+    included."""
+    lines = [side.along(share)[:-1] for side, share in zip(panel.edges, shares, strict=True)]
     outline = np.concatenate(lines)
-    first = np.cumsum([0, *counts])
-    sides = [np.arange(first[k], first[k + 1] + 1) % len(outline) for k in range(len(counts))]
+    first = np.cumsum([0, *(len(line) for line in lines)])
+    sides = [np.arange(first[k], first[k + 1] + 1) % len(outline) for k in range(len(lines))]
+    points, creases = _creased(panel, outline, sides, shares, ends, edge, where)
     inner = _grid_inside(outline, edge)
-    points = np.concatenate([outline, inner])
+    if len(creases) and len(inner):
+        dense = np.concatenate([_dense(points[line], edge) for line in creases])
+        inner = inner[cKDTree(dense).query(inner)[0] > _FROM_OUTLINE * edge]
+    points = np.concatenate([points, inner])
     rim = np.stack([np.arange(len(outline)), np.roll(np.arange(len(outline)), -1)], axis=1)
     triangles = np.zeros((0, 3), dtype=np.int64)
     if len(outline) >= 3:
@@ -126,20 +196,65 @@ def _meshed(panel: PatternPanel, counts: list[int], edge: float, where: str) -> 
         corners = points[triangles]
         area = np.linalg.det(corners[:, 1:] - corners[:, :1])
         triangles = triangles[np.abs(area) > 1e-6 * edge * edge]
-    sorted_rim = np.sort(rim, axis=1)
-    known = {tuple(pair) for pair in np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()}
-    missing = [row for row, pair in enumerate(sorted_rim.tolist()) if tuple(pair) not in known]
-    if missing or not len(triangles):
-        number = int(np.searchsorted(first, missing[0] if missing else 0, side="right")) - 1
+    missing = _missing(triangles, rim)
+    if len(missing) or not len(triangles):
+        number = int(np.searchsorted(first, missing[0] if len(missing) else 0, side="right")) - 1
         raise ValueError(
             f"{where}: panel {panel.name!r} is too narrow at edge {panel.numbers[number]} for edges of {1e3 * edge:g} mm; "
             "give a smaller edge=, or widen it"
         )
+    for number, line in enumerate(creases):
+        if len(_missing(triangles, np.stack([line[:-1], line[1:]], axis=1))):
+            raise ValueError(
+                f"{where}: panel {panel.name!r}: fold {number} leaves the panel, or is too near to its outline or to another "
+                f"fold for edges of {1e3 * edge:g} mm; give a smaller edge=, or move it"
+            )
     area = np.linalg.det(points[triangles][:, 1:] - points[triangles][:, :1])
     along = _signed_area(outline) > 0
     flip = (area > 0) != along
     triangles[flip] = triangles[flip][:, ::-1]
-    return points, triangles, sides
+    return points, triangles, sides, creases
+
+
+def _missing(triangles: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Rows of pairs (N, 2) of points that are no side of a triangle."""
+    known = {tuple(pair) for pair in np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()}
+    return np.flatnonzero([tuple(pair) not in known for pair in np.sort(pairs, axis=1).tolist()])
+
+
+def _creased(
+    panel: PatternPanel,
+    outline: np.ndarray,
+    sides: list[np.ndarray],
+    shares: list[np.ndarray],
+    ends: list[tuple[_Place, _Place]],
+    edge: float,
+    where: str,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The outline (N, 2) with points along the folds behind it, and which of them every fold has."""
+    points, creases = [outline], []
+    count = len(outline)
+    for fold, places in zip(panel.folds, ends, strict=True):
+        tips = []
+        for place, end in zip(places, (fold.start, fold.end), strict=True):
+            if place is None:
+                if not _inside(end[None], outline)[0]:
+                    x, y = 1e2 * end
+                    raise ValueError(
+                        f"{where}: panel {panel.name!r}: the end ({x:.1f}, {y:.1f}) cm of a fold is outside; move it"
+                    )
+                points.append(end[None])
+                tips.append(count)
+                count += 1
+            else:
+                tips.append(int(sides[place[0]][np.abs(shares[place[0]] - place[1]).argmin()]))
+        start, last = (np.concatenate(points)[tip] for tip in tips)
+        parts = max(round(float(np.linalg.norm(last - start)) / edge), 1)
+        share = np.linspace(0.0, 1.0, parts + 1)[1:-1, None]
+        points.append((1.0 - share) * start + share * last)
+        creases.append(np.array([tips[0], *range(count, count + parts - 1), tips[1]]))
+        count += parts - 1
+    return np.concatenate(points), creases
 
 
 def _signed_area(outline: np.ndarray) -> float:

@@ -149,6 +149,17 @@ def _stiffer(garment: Garment) -> str | None:
     return f"{len(other)} vertices, {factors} times"
 
 
+def _construction(garment: Garment) -> str | None:
+    """How many triangles have elastic, folds and stiff seams; None where none has."""
+    made = garment.construction
+    counts = {
+        "elastic": 0 if made.elastic is None else int((made.elastic != 1.0).any(axis=1).sum()),
+        "folds": 0 if made.fold is None else int((~np.isnan(made.fold)).any(axis=1).sum()),
+        "layers": 0 if made.bending is None else int((made.bending != 1.0).any(axis=1).sum()),
+    }
+    return ", ".join(f"{name} ({count} triangles)" for name, count in counts.items() if count) or None
+
+
 def _garment_facts(garment: Garment) -> dict[str, Any]:
     return {
         "vertices": len(garment.rest_pos),
@@ -159,6 +170,7 @@ def _garment_facts(garment: Garment) -> dict[str, Any]:
         "fasteners": ", ".join(f"{name} ({len(pairs)} pairs)" for name, pairs in (garment.fasteners or {}).items()) or None,
         "panels": ", ".join(f"{name} ({int(mask.sum())} faces)" for name, mask in (garment.panels or {}).items()) or None,
         "stiffer than the fabric": _stiffer(garment),
+        "construction": _construction(garment),
         "texture coordinates": 0 if garment.uv is None else len(garment.uv),
         "hard edges": garment.normal_faces is not None,
         "vertex colours": garment.colours is not None,

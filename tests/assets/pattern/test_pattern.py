@@ -8,11 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from sewing_patterns import PATTERNS, panel, skirt, specification, write
 
+from hood.assets.material import Material
+from hood.assets.pattern.making import with_elastic
 from hood.assets.pattern.pattern import Edge, read_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
+from hood.cloth.cloth import build_cloth
 from hood.mesh import topology
+from hood.mesh.flat import stretched_sides
 
 #: Openings of every pattern.
 _OPENINGS = {"skirt": 2, "tshirt": 4, "bodice": 4, "trousers": 3}
@@ -159,3 +164,100 @@ def test_three_layers_in_a_seam_are_refused(tmp_path: Path) -> None:
         _sheet(tmp_path, tube, 0.15)
     with pytest.raises(ValueError, match="panel 'a' is sewn to itself over one edge; give a smaller edge="):
         _sheet(tmp_path, tube, 0.3)
+
+
+def _made(**hood: Any) -> dict[str, Any]:
+    """A square of 40 cm sewn to another above it."""
+    points = [[0, 0], [40, 0], [40, 40], [0, 40]]
+    lower, upper = panel(points), panel(points, None, (0, 40, 0))
+    return specification({"a": lower | {"hood": hood}, "b": upper}, [("a", 2, "b", 0)])
+
+
+def test_elastic_of_a_panel_and_of_an_edge(tmp_path: Path) -> None:
+    sheet = _sheet(tmp_path, _made(elastic=[0.85, 1.1]), 0.05)
+    edges = sheet.flat[:, 1:] - sheet.flat[:, :1]
+    assert sheet.made.elastic is not None
+    wanted = stretched_sides(edges, np.tile([1.0, 0.0], (len(edges), 1)), 0.85, 1.1)
+    np.testing.assert_allclose(sheet.made.elastic[sheet.panels["a"]], wanted[sheet.panels["a"]])
+    assert (sheet.made.elastic[sheet.panels["b"]] == 1.0).all()
+    content = _made()
+    content["pattern"]["panels"]["b"]["edges"][2]["hood"] = {"elastic": 0.7, "bending": 4, "width": 6}
+    sheet = _sheet(tmp_path, content, 0.02)
+    low = sheet.pos[sheet.faces].mean(axis=1)[:, 1] < 0.73
+    assert sheet.made.elastic is not None
+    assert sheet.made.bending is not None
+    assert (sheet.made.elastic[low] == 1.0).all()
+    rim = sheet.pos[:, 1] > 0.8 - 1e-9
+    on_rim = np.stack([np.roll(rim[sheet.faces], -1, axis=1), np.roll(rim[sheet.faces], -2, axis=1)]).all(axis=0)
+    np.testing.assert_allclose(sheet.made.elastic[on_rim], 0.7)
+    assert (sheet.made.bending[on_rim] == 4.0).all()
+    held = with_elastic(_sheet(tmp_path, _made(), 0.02), rim, 0.9, 0.03)
+    assert held.made.elastic is not None
+    np.testing.assert_allclose(held.made.elastic[on_rim], 0.9)
+
+
+@pytest.mark.parametrize("edge", [0.05, 0.021])
+def test_edges_lie_along_folds_and_seams_have_angles_and_layers(tmp_path: Path, edge: float) -> None:
+    fold = {"from": [13, 0], "to": [17, 40], "angle": 120, "bending": 2}
+    inner = {"from": [25, 10], "to": [33, 30], "angle": -90}
+    content = _made(folds=[fold, inner])
+    content["pattern"]["stitches"][0][0]["hood"] = {"angle": 45, "bending": 5}
+    sheet = _sheet(tmp_path, content, edge)
+    cloth = build_cloth(sheet.pos, sheet.faces, Material(), dtype=torch.float64, flat=sheet.flat, made=sheet.made)
+    ends = cloth.rest_pos[cloth.hinges[:, :2]]
+    for degrees, start, end, factor in ((120, (0.13, 0), (0.17, 0.4), 2), (-90, (0.25, 0.1), (0.33, 0.3), 1)):
+        found = ends[(cloth.rest_angle.abs() - np.radians(abs(degrees))).abs() < 1e-9]
+        length = float((found[:, 1] - found[:, 0]).norm(dim=1).sum())
+        assert length == pytest.approx(float(np.hypot(end[0] - start[0], end[1] - start[1])), rel=1e-9)
+        way = np.subtract(end, start)
+        off = (found[..., 0] - start[0]) * way[1] - (found[..., 1] - start[1]) * way[0]
+        assert float(off.abs().max()) < 1e-9
+        assert factor in (cloth.bending_stiffness / Material().bending_stiffness).unique().tolist()
+    seam = (cloth.rest_angle.abs() - np.radians(45)).abs() < 1e-9
+    assert float((ends[seam][:, 1] - ends[seam][:, 0]).norm(dim=1).sum()) == pytest.approx(0.4)
+    torch.testing.assert_close(
+        cloth.bending_stiffness[seam], torch.full((int(seam.sum()),), 5 * Material().bending_stiffness).double()
+    )
+    # The sewn sides share the place where the fold ends.
+    assert np.isclose(sheet.pos, [0.17, 0.4, 0.0], atol=1e-9).all(axis=1).sum() == 1
+    assert len(topology.boundary_loops(sheet.faces)) == 1
+
+
+def test_a_fold_keeps_its_side_where_its_panel_is_turned_over(tmp_path: Path) -> None:
+    content = _made(folds=[{"from": [20, 0], "to": [20, 40], "angle": 30}])
+    plain = _sheet(tmp_path, content, 0.1)
+    content["pattern"]["panels"]["a"]["edges"] = [
+        {"endpoints": edge["endpoints"][::-1]} for edge in content["pattern"]["panels"]["a"]["edges"][::-1]
+    ]
+    for side in content["pattern"]["stitches"][0]:
+        side["edge"] = 1 if side["panel"] == "a" else 0
+    content["pattern"]["stitches"][0].append("right_wrong")
+    other = _sheet(tmp_path, content, 0.1)
+    assert plain.made.fold is not None
+    assert other.made.fold is not None
+    assert float(np.nanmean(plain.made.fold)) == pytest.approx(np.radians(30))
+    # The outline runs the other way, so its outer side is the other one; its faces look as those of the other panel do.
+    facing = np.cross(*(other.pos[other.faces[:, k]] - other.pos[other.faces[:, 0]] for k in (1, 2)))[:, 2]
+    assert np.sign(np.nanmean(other.made.fold)) == -np.sign(facing[other.panels["a"]].mean())
+
+
+@pytest.mark.parametrize(
+    ("hood", "message"),
+    [
+        ({"elastic": 0}, r"panel 'a': hood.elastic is 0; give a number from 0.2 to 2"),
+        ({"elastic": [0.8]}, r"hood.elastic is \[0.8\]; give one factor along x, or two"),
+        ({"pleats": 3}, r"panel 'a': hood is {'pleats': 3}; give a table of elastic, folds"),
+        ({"folds": 3}, r"hood.folds is no list"),
+        ({"folds": [{"from": [0, 0]}]}, r"fold 0 is .*give from: \[x, y\], to: \[x, y\], angle"),
+        ({"folds": [{"from": [0, 0], "to": [0, 0], "angle": 9}]}, r"fold 0 has no length"),
+        ({"folds": [{"from": [0, 0], "to": [9, 9], "angle": 180}]}, r"fold 0: its angle is 180; give degrees between"),
+        ({"folds": [{"from": [0, 0], "to": [90, 9], "angle": 18}]}, r"the end \(90.0, 9.0\) cm of a fold is outside; move it"),
+        (
+            {"folds": [{"from": [20, 0], "to": [20, 40], "angle": 9}, {"from": [0, 20], "to": [40, 21], "angle": 9}]},
+            r"panel 'a': fold \d .* too near to its outline or to another fold for edges of 40 mm",
+        ),
+    ],
+)
+def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _sheet(tmp_path, _made(**hood))
