@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 #: Bytes a thread may keep in memory because there are no registers for them.
 LEAST = 256
 #: Generations of GPUs: Ampere, Hopper, Blackwell.
-CAPABILITIES = (80, 90, 120)
+CAPABILITIES = [pytest.param(80, marks=pytest.mark.slow), 90, pytest.param(120, marks=pytest.mark.slow)]
 
 
 def spilled(

@@ -96,7 +96,7 @@ def test_five_hundred_random_queries(tmp_path):
 
 
 @pytest.mark.parametrize("capability", CAPABILITIES)
-@pytest.mark.parametrize("dtype", ["*fp32", "*fp64"])
+@pytest.mark.parametrize("dtype", ["*fp32", pytest.param("*fp64", marks=pytest.mark.slow)])
 def test_registers_suffice(dtype, capability, tmp_path, monkeypatch):
     pytest.importorskip("triton", reason="Triton is built for Linux only")
     from hood.mesh.closest_point import triton_nearest
