@@ -15,7 +15,7 @@ MODULES = {
     "hood/app/train.py": "one training from its words to its weights",
     "hood/assets/fitting/fit_search.py": "one search over unit, axis, facing, place and arm angle, from coarse to fine",
     "hood/assets/formats/gltf_animation.py": "one chapter of glTF: nodes in time, and the vertices that follow them",
-    "hood/assets/pattern/pattern.py": "one format: panels, edges and stitches as read, what of them cannot be sewn, each with its sentence",
+    "hood/assets/pattern/pattern.py": "one format as it is read, and a sentence for whatever in it cannot be sewn",
     "hood/assets/pattern/sheet.py": "one way from a pattern to a mesh: divisions, folds, triangles, welds, windings",
     "hood/assets/motion/animated_mesh.py": "a moving mesh as a body: read or given, its unit, bearing, seams and sides",
     "hood/assets/motion/load.py": "one motion: read or given, its up axis, its cut and its start",

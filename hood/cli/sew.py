@@ -32,8 +32,8 @@ from hood.rollouts.sewing import Sewn, sew_around, waist_of
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
-#: Of ``waist``; and how wide [m] and how stiff its elastic is, in shear [N/m]: it stretches by 10% under 1.5 N for each 3 cm.
-HELD, _WAISTBAND, _SHEAR = "held", 0.03, 169.0
+#: Of ``waist``; what auto takes, how wide [m] its elastic is and how stiff in shear [N/m]: 3 cm stretch by 10% under 1.5 N.
+HELD, _DRAWN, _WAISTBAND, _SHEAR = "held", 0.85, 0.03, 169.0
 #: Arms of the poses of the T and the A, degrees below the former.
 _TPOSE, _APOSE = 0.0, 45.0
 #: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
@@ -60,12 +60,8 @@ def run(arguments: Sequence[str]) -> int:
     target = _target(config, pattern)
     picture = _picture(config, target)
     body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
-    waist = None if config.waist == HELD else _number(config, "waist", *ELASTIC, f", or {HELD}")
-    sheet = sheet_of(pattern, edge, str(path))
-    rim = waist_of(sheet, float(np.ptp(body.shaped(betas)[0][:, 1])))
-    if waist is not None and rim.any() and not (rim & sheet.gathered).any():
-        stiffness = _SHEAR / float(np.mean(values_of(material.lame_mu)[0]) * np.mean(values_of(material.thickness)[0]))
-        sheet = with_elastic(sheet, rim, waist, _WAISTBAND, max(stiffness, 1.0))
+    factor = _waist(config)
+    sheet = _with_waist(sheet_of(pattern, edge, str(path)), factor, float(np.ptp(body.shaped(betas)[0][:, 1])), material)
     prepare_folder(target.parent)
     angles = [angle] if angle is not None else ([_APOSE, _TPOSE] if _sleeved(pattern) else [_TPOSE, _APOSE])
     found = [_attempt(sheet, posed_body(body, arms_down(angles[0]), 0, betas), material)]
@@ -96,6 +92,22 @@ def _number(config: DictConfig, key: str, low: float, high: float, other: str = 
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise ConfigError(f"{key}={shown(value)}: give a number from {low:g} to {high:g}{other}")
     return float(value)
+
+
+def _waist(config: DictConfig) -> float | None:
+    """How many times as long as it is cut the elastic of a waist is at rest; None: it is held."""
+    if str(config.waist) in (AUTO, HELD):
+        return _DRAWN if str(config.waist) == AUTO else None
+    return _number(config, "waist", *ELASTIC, f", {AUTO} or {HELD}")
+
+
+def _with_waist(sheet: PatternSheet, factor: float | None, height: float, material: Material) -> PatternSheet:
+    """The pattern with elastic along its waist, where it has one and no elastic there, on a body of ``height`` [m]."""
+    rim = waist_of(sheet, height)
+    if factor is None or not rim.any() or (rim & sheet.gathered).any():
+        return sheet
+    shear = float(np.mean(values_of(material.lame_mu)[0]) * np.mean(values_of(material.thickness)[0]))
+    return with_elastic(sheet, rim, factor, _WAISTBAND, max(_SHEAR / shear, 1.0))
 
 
 def _target(config: DictConfig, pattern: Pattern) -> Path:
@@ -156,6 +168,9 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
     ]
     if sewn.held.any():
         lines.append(f"its waist is held, {int(sewn.held.sum())} vertices; pins=none of hood rollout lets it go")
+    if sheet.made.elastic is not None:
+        count = int((sheet.made.elastic != 1.0).any(axis=1).sum())
+        lines.append(f"elastic in {count} triangles; waist=held holds a waist instead")
     return lines
 
 

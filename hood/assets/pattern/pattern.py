@@ -205,7 +205,8 @@ def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     edges, numbers = [], _loop(where, ends)
     for number in numbers:
         edge, there = own["edges"][number], f"{where}, edge {number}"
-        plain = _edge(there, edge, *vertices[list(ends[number])], scale)
+        start, end = vertices[list(ends[number])]
+        plain = _edge(there, edge, start, end, scale)
         edges.append(replace(plain, making=edge_making(there, edge, scale)))
         if edges[-1].length < _SHORTEST:
             raise ValueError(f"{there} has no length; merge its two vertices")
