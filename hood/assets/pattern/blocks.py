@@ -54,6 +54,12 @@ class Table:
         turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         self.panels[name] = PatternPanel(name, tuple(edges), tuple(range(len(edges))), turn, np.array(at, dtype=float), label)
         self._keys[name] = [side.key for side in outline]
+        self._sew_darts(name)
+
+    def _sew_darts(self, name: str) -> None:
+        for key in self._keys[name]:
+            if key.endswith("dart_a"):
+                self.sew((name, key), (name, key.replace("dart_a", "dart_b")))
 
     def mirror(self, name: str, other: str) -> None:
         """Panel ``other``, the mirror image of a panel, with the same keys."""
@@ -65,6 +71,7 @@ class Table:
         placed = over @ panel.rotation @ over, over @ panel.translation
         self.panels[other] = PatternPanel(other, tuple(edges), panel.numbers, *placed, panel.label)
         self._keys[other] = self._keys[name][::-1]
+        self._sew_darts(other)
 
     def keys(self, name: str, beginning: str) -> list[tuple[str, str]]:
         """The sides of a panel whose keys begin so, from the right of the body to its left for a panel in front, and from its
@@ -197,6 +204,11 @@ def upper_half(m: Measures, back: bool, ease: float, neck: Neck, drop: float = 0
     return [Side("armhole", armpit, armhole), Side("shoulder", _point(tip)), Side("neck", _point(side), curve)], low
 
 
+def _dart(width: float) -> float:
+    """Width [m] of a dart of about that width; none where it is too narrow."""
+    return 0.0 if width < 0.01 else min(width, 0.035)
+
+
 def _point(array: np.ndarray) -> Point:
     return float(array[0]), float(array[1])
 
@@ -223,22 +235,18 @@ def torso(t: Table, m: Measures, ease: float, length: float, neck: Neck, fit: fl
 def bodice(t: Table, m: Measures, ease: float, neck: Neck) -> tuple[float, float]:
     """A bodice to the waist with a dart in each quarter; lengths [m] of the pieces of its waist from the middle and the side."""
     waist, chest = 0.25 * m.waist * (1.0 + max(ease, 0.04)), 0.25 * m.chest * (1.0 + ease)
-    dart, inner = float(np.clip(0.6 * (chest - waist), 0.008, 0.035)), 0.5 * waist
+    dart, inner = _dart(0.6 * (chest - waist)), 0.5 * waist
     for back in (False, True):
         upper, end = upper_half(m, back, ease, neck)
         low, apex = m.waist_height, m.waist_height + 0.7 * (upper[0].start[1] - m.waist_height)
         half = [
             Side("hem0", (0.0, low)),
-            Side("dart_a", (inner, low)),
-            Side("dart_b", (inner + 0.5 * dart, apex)),
+            *([Side("dart_a", (inner, low)), Side("dart_b", (inner + 0.5 * dart, apex))] if dart else []),
             Side("hem1", (inner + dart, low)),
             Side("side", (waist + dart, low)),
             *upper,
         ]
-        name = "back" if back else "front"
-        t.draw(name, whole(half, end, back), *place(m, back))
-        for side in ("left", "right"):
-            t.sew((name, f"{side}_dart_a"), (name, f"{side}_dart_b"))
+        t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
     t.sew_keys("front", "back", ["side", "shoulder"])
     return inner, waist - inner
 
@@ -315,23 +323,20 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
     """Front and back of a skirt with a dart in each quarter, from ``top`` [m]; pieces of its waist as of :func:`bodice`."""
     hem, hip = m.waist_height * (1.0 - length), 0.25 * m.hips * (1.0 + ease)
     inner, outer = pieces
-    dart = float(np.clip(0.45 * (hip - inner - outer), 0.008, 0.035)) if flare < 0.3 else 0.008
+    dart = _dart(0.45 * (hip - inner - outer)) if flare < 0.3 else 0.0
     side, low = inner + outer + dart, hip * (1.0 + flare)
     hip = max(hip, side + (low - side) * (top - m.hip_height) / (top - hem))
+    apex = (inner + 0.5 * dart, top - 0.6 * (top - m.hip_height))
     half = [
         Side("hem", (0.0, hem), ((0.6 * low, hem),)),
         Side("side0", (low, hem + 0.15 * (low - hip))),
         Side("side1", (hip, m.hip_height), ((hip, m.hip_height + 0.55 * (top - m.hip_height)),) if flare < 0.3 else ()),
         Side("waist1", (side, top)),
-        Side("dart_a", (inner + dart, top)),
-        Side("dart_b", (inner + 0.5 * dart, top - 0.6 * (top - m.hip_height))),
+        *([Side("dart_a", (inner + dart, top)), Side("dart_b", apex)] if dart else []),
         Side("waist0", (inner, top)),
     ]
     for back in (False, True):
-        name = f"skirt_{'back' if back else 'front'}"
-        t.draw(name, whole(half, (0.0, top), back), *place(m, back))
-        for own in ("left", "right"):
-            t.sew((name, f"{own}_dart_a"), (name, f"{own}_dart_b"))
+        t.draw(f"skirt_{'back' if back else 'front'}", whole(half, (0.0, top), back), *place(m, back))
     t.sew_keys("skirt_front", "skirt_back", ["side"])
 
 
@@ -370,7 +375,8 @@ def gores(t: Table, ring: float, circle: float, length: float, top: Point, tilt:
 
 
 class Leg(NamedTuple):
-    """Of trousers: see :data:`hood.assets.pattern.designs.MEANINGS`; ``top`` is the height [m] of their upper edge, ``pieces`` those of its quarters."""
+    """Of trousers, see :data:`hood.assets.pattern.designs.MEANINGS`; ``top`` is the height [m] of their waist, which each
+    quarter has in two ``pieces`` [m]."""
 
     ease: float
     knee: float
@@ -391,10 +397,12 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
     share = min((crotch - low) / (crotch - m.knee_height), 1.0)
     wide = leg.hem * (knee if bends else (1.0 - share) * 0.5 * m.thigh * (1.0 + 0.5 * leg.ease + 0.08) + share * knee)
     hem_out = outer + 0.5 * (wide - knee) if bends else hip + (outer - hip) * share
-    inseam = 0.0
+    width, inseam = sum(leg.pieces), 0.0
+    # The middle of the back is higher than the side, and both halves have their side in one place.
+    side = (0.015 + math.sqrt((width + max(_dart(0.35 * (hip - width)), 0.01)) ** 2 - 0.02**2), leg.top)
     for back in (False, True):
         reach = m.hips * (0.105 if back else 0.055)
-        middle, top = ((0.025, leg.top + 0.02) if back else (0.008, leg.top)), leg.top
+        middle, depth = (0.015, leg.top + 0.02) if back else (0.01, leg.top), leg.top - m.hip_height
         joint = (outer - knee, m.knee_height) if bends else (hem_out - wide, low)
 
         def inner(height: float, joint: Point = joint, reach: float = reach) -> Side:
@@ -413,10 +421,9 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         low_end = Side("outer0", (hem_out, low)), Side("outer1", (outer, m.knee_height))
         sides = [Side("hem", (hem_out - wide, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
         seat = fork + max(0.08, 1.1 * reach)
-        waist = _slanted(middle, top, leg.pieces, hip, top - m.hip_height)
         sides += [
-            Side("outer2", (hip, m.hip_height), ((hip, m.hip_height + 0.5 * (top - m.hip_height)),)),
-            *waist,
+            Side("outer2", (hip, m.hip_height), ((hip, m.hip_height + 0.5 * depth),)),
+            *_slanted(middle, side, leg.pieces, depth),
             Side("centre", middle),
             Side("crotch", (0.0, seat), ((0.0, fork + 0.3 * (seat - fork)), (-0.35 * reach, fork))),
             inner(fork),
@@ -429,19 +436,16 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         t.mirror(f"{own}_leg_{name}", f"{_other(own)}_leg_{name}")
     for own in ("left", "right"):
         t.sew_keys(f"{own}_leg_front", f"{own}_leg_back", ["outer", "inner"])
-        for name in ("front", "back"):
-            t.sew((f"{own}_leg_{name}", "dart_a"), (f"{own}_leg_{name}", "dart_b"))
     for name in ("front", "back"):
         t.sew_keys(f"left_leg_{name}", f"right_leg_{name}", ["centre", "crotch"])
 
 
-def _slanted(middle: Point, top: float, pieces: tuple[float, float], hip: float, depth: float) -> list[Side]:
-    """The waist of a leg from the side at height ``top`` to its ``middle``: two pieces and a dart between them."""
-    inner, outer = pieces
-    dart = float(np.clip(0.4 * (hip - inner - outer), 0.008, 0.03))
-    across = math.sqrt((inner + outer + dart) ** 2 - (middle[1] - top) ** 2)
-    side = np.array([middle[0] + across, top])
-    way = (np.array(middle) - side) / (inner + outer + dart)
+def _slanted(middle: Point, corner: Point, pieces: tuple[float, float], depth: float) -> list[Side]:
+    """The waist of a leg from its corner at the side to the middle: two pieces and a dart between them."""
+    (inner, outer), side = pieces, np.array(corner)
+    way = np.array(middle) - side
+    dart = float(np.linalg.norm(way)) - inner - outer
+    way /= inner + outer + dart
     first, apex = side + outer * way, side + (outer + 0.5 * dart) * way + 0.5 * max(depth, 0.06) * np.array([-way[1], way[0]])
     return [
         Side("waist1", _point(side)),

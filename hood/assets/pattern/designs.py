@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.files.library import unknown
-
+from hood.assets.files.library import nearest, unknown
 from hood.assets.pattern.blocks import (
     Leg, Neck, Side, Table, band, bodice, gores, legs, place, skirt, sleeves, strip, tiers, torso,
     upper_half, whole,
@@ -91,10 +90,12 @@ def draft(name: str, measures: Measures, options: Mapping[str, Any] | None = Non
     if name not in DESIGNS:
         raise ValueError(unknown("design", name, DESIGNS))
     design = DESIGNS[name]
-    chosen = {key: known[0] for key, known in design.options.items()}
+    chosen: dict[str, float | str] = {key: own[0] for key, own in design.options.items()}
     for key, value in (options or {}).items():
         if key not in chosen:
-            raise ValueError(f"design:{name}: {unknown('option', key, [ranged(name, known) for known in chosen])}")
+            meant = nearest(key, chosen)
+            known = [ranged(name, one) for one in chosen]
+            raise ValueError(f"design:{name}: {unknown('option', key, known, meant and ranged(name, meant))}")
         chosen[key] = _checked(name, key, value)
     table = Table()
     design.draw(table, measures, Options(chosen))
@@ -158,7 +159,7 @@ def _sleeved(t: Table, m: Measures, o: Options, puff: float = 1.01) -> None:
     length=(0.2, 0.05, 0.5),
     depth=(0.32, 0.15, 0.5),
     width=(0.35, 0.1, 0.5),
-    strap=(0.75, 0.6, 0.95),
+    strap=(0.75, 0.7, 0.95),
     shape=("round", "v"),
     fit=(0.3, 0.0, 1.0),
 )
@@ -182,7 +183,7 @@ def _tshirt(t: Table, m: Measures, o: Options) -> None:
 
 
 def _collar(t: Table, m: Measures, height: float) -> None:
-    """A stand of two strips on the neckline, open in front."""
+    """A stand of two strips on the neckline."""
     for back in (False, True):
         name = "back" if back else "front"
         below = t.keys(name, "neck")
