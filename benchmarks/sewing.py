@@ -1,4 +1,4 @@
-"""Own designs (``hood sew design:NAME``) sewn on bodies of three shapes: a table of how each ends, and of what they do when worn.
+"""Own designs (``hood sew design:NAME``) sewn on bodies of three shapes: how each ends, and what it does when it is worn.
 
     python benchmarks/sewing.py --edge 0.03 --limit 120 --csv sewing.csv --pictures outputs/sewing
     python benchmarks/sewing.py --designs tshirt skirt --first 1 --betas 0 --wear walk_brisk

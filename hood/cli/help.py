@@ -104,7 +104,11 @@ _EXAMPLES = {
     ],
 }
 #: Words of a command that are no keys.
-_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] ", "sew": "FILE|design:NAME "}
+_BEFORE_KEYS = {
+    **dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "),
+    "fabric": "[NAME ...] ",
+    "sew": "FILE|design:NAME ",
+}
 
 
 #: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.

@@ -50,7 +50,9 @@ def run(arguments: Sequence[str]) -> int:
     words, config = split_words("sew", arguments)
     if len(words) != 1:
         given = f"{len(words)} files are given" if words else "no file is given"
-        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz, or a design, hood sew design:tshirt")
+        raise ConfigError(
+            f"{given}: write one, hood sew specification.json output=shirt.npz, or a design, hood sew design:tshirt"
+        )
     word, edge = words[0], _number(config, "edge", _FINEST, _COARSEST)
     gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
     if angle is None and str(config.pose) != AUTO:

@@ -19,6 +19,8 @@ from hood.assets.pattern.pattern import Edge, PatternPanel, Stitch
 
 Point = tuple[float, float]
 Place = tuple[float, float, float]
+#: A panel, and a side of it.
+Key = tuple[str, str]
 #: Panels begin so far [m] before and behind the trunk; those of a sleeve from the skin of the arm.
 _APART, _FROM_ARM = 0.05, 0.035
 #: Degrees of the arms below the T-pose, for which sleeves are placed.
@@ -73,24 +75,24 @@ class Table:
         self._keys[other] = self._keys[name][::-1]
         self._sew_darts(other)
 
-    def keys(self, name: str, beginning: str) -> list[tuple[str, str]]:
+    def keys(self, name: str, beginning: str) -> list[Key]:
         """The sides of a panel whose keys begin so, from the right of the body to its left for a panel in front, and from its
         left to its right for one behind: as the panel is seen."""
         panel, found = self.panels[name], [key for key in self._keys[name] if _bare(key).startswith(beginning)]
         middle = {key: float(panel.edges[self._keys[name].index(key)].at(np.array([0.5]))[0, 0]) for key in found}
         return [(name, key) for key in sorted(found, key=lambda key: middle[key])]
 
-    def edge(self, side: tuple[str, str]) -> Edge:
+    def edge(self, side: Key) -> Edge:
         return self.panels[side[0]].edges[self._keys[side[0]].index(side[1])]
 
-    def lengths(self, sides: Sequence[tuple[str, str]]) -> list[float]:
+    def lengths(self, sides: Sequence[Key]) -> list[float]:
         return [self.edge(side).length for side in sides]
 
-    def sew(self, first: tuple[str, str], second: tuple[str, str], same: bool = False) -> None:
+    def sew(self, first: Key, second: Key, same: bool = False) -> None:
         ends = [(name, self._keys[name].index(key)) for name, key in (first, second)]
         self.stitches.append(Stitch(ends[0], ends[1], same))
 
-    def sew_all(self, first: Sequence[tuple[str, str]], second: Sequence[tuple[str, str]]) -> None:
+    def sew_all(self, first: Sequence[Key], second: Sequence[Key]) -> None:
         for one, other in zip(first, second, strict=True):
             self.sew(one, other)
 
@@ -137,7 +139,7 @@ def place(m: Measures, back: bool) -> tuple[Place, Place]:
 
 
 def strip(
-    t: Table, name: str, above: Sequence[float], below: Sequence[float], height: float, bottom: float, place: tuple[Place, Place]
+    t: Table, name: str, above: Sequence[float], below: Sequence[float], height: float, bottom: float, at: tuple[Place, Place]
 ) -> None:
     """A strip of cloth, its upper and lower edge divided into pieces of those lengths [m], from left to right as it is seen."""
     x, wide = -0.5 * sum(below), 0.5 * sum(above)
@@ -145,16 +147,16 @@ def strip(
     for number, length in enumerate(below):
         sides.append(Side(f"below{number}", (x, bottom)))
         x += length
-    sides.append(Side("right_side" if place[0][1] else "left_side", (x, bottom)))
+    sides.append(Side("right_side" if at[0][1] else "left_side", (x, bottom)))
     x = wide
     for number in reversed(range(len(above))):
         sides.append(Side(f"{'top' if len(above) == 1 else 'above'}{number}", (x, bottom + height)))
         x -= above[number]
-    sides.append(Side("left_side" if place[0][1] else "right_side", (-wide, bottom + height)))
-    t.draw(name, sides, *place)
+    sides.append(Side("left_side" if at[0][1] else "right_side", (-wide, bottom + height)))
+    t.draw(name, sides, *at)
 
 
-def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[tuple[str, str]]], height: float, top: float) -> None:
+def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[Key]], height: float, top: float) -> None:
     """A waistband of two strips over edges of the front (False) and of the back (True)."""
     for back, below in edges.items():
         name, lengths = f"band_{'back' if back else 'front'}", t.lengths(below)
@@ -164,7 +166,13 @@ def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[tuple[str, str]]],
 
 
 def tiers(
-    t: Table, m: Measures, edges: Mapping[bool, Sequence[tuple[str, str]]], top: float, length: float, count: int, gathers: float
+    t: Table,
+    m: Measures,
+    edges: Mapping[bool, Sequence[Key]],
+    top: float,
+    length: float,
+    count: int,
+    gathers: float,
 ) -> None:
     """Rows of gathered cloth below edges of the front (False) and of the back (True)."""
     for number in range(1, count + 1):
@@ -188,13 +196,13 @@ class Neck(NamedTuple):
     shape: str = "round"
 
 
-def upper_half(m: Measures, back: bool, ease: float, neck: Neck, drop: float = 0.0) -> tuple[list[Side], Point]:
+def upper_half(m: Measures, back: bool, ease: float, neck: Neck) -> tuple[list[Side], Point]:
     """Half of a bodice from the underarm to the middle of the neckline: armhole, shoulder, neckline; and where that ends."""
     over = m.back_length if back else float(np.clip(m.front_length, m.back_length - 0.01, m.back_length + 0.025))
     top, slope = m.waist_height + over, max(m.neck_height - m.shoulder_height, 0.01)
     inner, outer = np.array([m.neck_width, top]), np.array([0.5 * m.shoulder_width, top - slope])
     side, tip = inner + neck.width * (outer - inner), inner + neck.strap * (outer - inner)
-    armpit = (0.25 * m.chest * (1.0 + ease), m.underarm_height - 0.01 - drop)
+    armpit = (0.25 * m.chest * (1.0 + ease), m.underarm_height - 0.02 - 0.1 * ease)
     across = min(tip[0], armpit[0]) - 0.02 * neck.strap
     armhole = ((across, armpit[1]), (across, 0.5 * (armpit[1] + tip[1])))
     depth = 0.02 + 0.05 * neck.width if back else neck.depth * over
@@ -233,7 +241,7 @@ def torso(t: Table, m: Measures, ease: float, length: float, neck: Neck, fit: fl
 
 
 def bodice(t: Table, m: Measures, ease: float, neck: Neck) -> tuple[float, float]:
-    """A bodice to the waist with a dart in each quarter; lengths [m] of the pieces of its waist from the middle and the side."""
+    """A bodice to the waist with a dart in each quarter; lengths [m] of the pieces of its waist from the middle on."""
     waist, chest = 0.25 * m.waist * (1.0 + max(ease, 0.04)), 0.25 * m.chest * (1.0 + ease)
     dart, inner = _dart(0.6 * (chest - waist)), 0.5 * waist
     for back in (False, True):
@@ -284,7 +292,12 @@ def sleeves(
     hems = (0.5 * (end + halves[0] - halves[1]), 0.5 * (end - halves[0] + halves[1]))
     tip, off = (0.5 * m.shoulder_width, m.shoulder_height + 0.01), m.upper_arm / (2.0 * math.pi) + _FROM_ARM
     for back in (False, True):
-        name, w, hem, at = "back" if back else "front", halves[back], hems[back], (*tip, m.shoulder[2] + (-off if back else off))
+        name, w, hem, at = (
+            "back" if back else "front",
+            halves[back],
+            hems[back],
+            (*tip, m.shoulder[2] + (-off if back else off)),
+        )
         cap = tuple(_point(point) for point in _cap(w, height).curve)
         outline = [
             Side("end", (0.0, -length)),
@@ -340,40 +353,6 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
     t.sew_keys("skirt_front", "skirt_back", ["side"])
 
 
-def gores(t: Table, ring: float, circle: float, length: float, top: Point, tilt: float) -> None:
-    """Four sectors of a share of a circle, sewn to a ring around an edge of length ``ring`` [m] at ``top``, its y and z; each
-    has two pieces there. They begin tilted outwards by ``tilt`` [degrees]."""
-    half, inner = 0.25 * math.pi * circle, ring / (2.0 * math.pi * circle)
-
-    def arc(radius: float, first: float, last: float) -> tuple[Point, tuple[Point, Point]]:
-        """Start and control points of an arc below the centre, between two angles from straight down."""
-        a, b, k = first, last, 4.0 / 3.0 * math.tan(0.25 * (last - first)) * radius
-        start, end = (radius * math.sin(a), -radius * math.cos(a)), (radius * math.sin(b), -radius * math.cos(b))
-        return start, (
-            (start[0] + k * math.cos(a), start[1] + k * math.sin(a)),
-            (end[0] - k * math.cos(b), end[1] - k * math.sin(b)),
-        )
-
-    low = inner + length
-    outline = [
-        Side("hem0", *arc(low, -half, 0.0)),
-        Side("hem1", *arc(low, 0.0, half)),
-        Side("ahead", arc(low, half, 0.0)[0]),
-        Side("waist0", *arc(inner, half, 0.0)),
-        Side("waist1", *arc(inner, 0.0, -half)),
-        Side("behind", arc(inner, -half, 0.0)[0]),
-    ]
-    names = ["gore_back_right", "gore_front_right", "gore_front_left", "gore_back_left"]
-    for name, around in zip(names, (-135.0, -45.0, 45.0, 135.0), strict=True):
-        angles = (-tilt, around, 0.0)
-        out = np.array([math.sin(math.radians(around)), 0.0, math.cos(math.radians(around))])
-        waist = Rotation.from_euler("xyz", angles, degrees=True).apply([0.0, -inner, 0.0])
-        at = (ring / (2.0 * math.pi) + 0.02) * out + [0.0, *top] - waist
-        t.draw(name, outline, angles, (float(at[0]), float(at[1]), float(at[2])))
-    for name, other in zip(names, names[1:] + names[:1], strict=True):
-        t.sew((name, "ahead"), (other, "behind"))
-
-
 class Leg(NamedTuple):
     """Of trousers, see :data:`hood.assets.pattern.designs.MEANINGS`; ``top`` is the height [m] of their waist, which each
     quarter has in two ``pieces`` [m]."""
@@ -403,7 +382,9 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
     for back in (False, True):
         reach = m.hips * (0.105 if back else 0.055)
         middle, depth = (0.015, leg.top + 0.02) if back else (0.01, leg.top), leg.top - m.hip_height
-        joint = (outer - knee, m.knee_height) if bends else (hem_out - wide, low)
+        # The nearer the hem is to the crotch, the more the back is wider there, as it is above.
+        more = 0.0 if bends else (1.0 - share) * (reach - 0.055 * m.hips)
+        joint = (outer - knee, m.knee_height) if bends else (hem_out - wide - more, low)
 
         def inner(height: float, joint: Point = joint, reach: float = reach) -> Side:
             rise = height - joint[1]
@@ -416,10 +397,10 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
 
         fork = crotch
         if back:
-            fork = float(brentq(lambda height: length(height) - inseam, joint[1] + 0.01, crotch + 0.02, xtol=1e-7))
+            fork = float(brentq(lambda height, own=inseam: length(height) - own, joint[1] + 0.01, crotch + 0.02, xtol=1e-7))
         inseam = length(fork)
         low_end = Side("outer0", (hem_out, low)), Side("outer1", (outer, m.knee_height))
-        sides = [Side("hem", (hem_out - wide, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
+        sides = [Side("hem", (hem_out - wide - more, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
         seat = fork + max(0.08, 1.1 * reach)
         sides += [
             Side("outer2", (hip, m.hip_height), ((hip, m.hip_height + 0.5 * depth),)),

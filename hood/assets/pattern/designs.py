@@ -5,14 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hood.assets.files.library import nearest, unknown
 from hood.assets.pattern.blocks import (
-    Leg, Neck, Side, Table, band, bodice, gores, legs, place, skirt, sleeves, strip, tiers, torso,
-    upper_half, whole,
+    Key,
+    Leg,
+    Neck,
+    Point,
+    Side,
+    Table,
+    band,
+    bodice,
+    legs,
+    place,
+    skirt,
+    sleeves,
+    strip,
+    tiers,
+    torso,
+    upper_half,
+    whole,
 )
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import MOST_GATHERED, Pattern, check_pattern
@@ -41,19 +58,8 @@ MEANINGS = {
     "hem": "width of the leg at its hem, as a share of that above it",
 }
 Range = tuple[float, float, float] | tuple[str, ...]
-
-
-class Options:
-    """Chosen options by name: numbers are attributes."""
-
-    def __init__(self, chosen: Mapping[str, float | str]) -> None:
-        self._chosen = chosen
-
-    def __getattr__(self, name: str) -> float:
-        return float(self._chosen[name])
-
-    def word(self, name: str) -> str:
-        return str(self._chosen[name])
+#: Chosen options: numbers and words by their names.
+Options = SimpleNamespace
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ def draft(name: str, measures: Measures, options: Mapping[str, Any] | None = Non
             raise ValueError(f"design:{name}: {unknown('option', key, known, meant and ranged(name, meant))}")
         chosen[key] = _checked(name, key, value)
     table = Table()
-    design.draw(table, measures, Options(chosen))
+    design.draw(table, measures, Options(**chosen))
     pattern = Pattern(name, table.panels, tuple(table.stitches))
     check_pattern(f"design:{name}", pattern, MOST_GATHERED)
     return pattern
@@ -107,8 +113,10 @@ def draft(name: str, measures: Measures, options: Mapping[str, Any] | None = Non
 def ranged(name: str, key: str) -> str:
     """An option of a design with what it may be."""
     known = DESIGNS[name].options[key]
-    return f"{key} ({known[1]:g} to {known[2]:g})" if len(known) == 3 and not isinstance(known[0], str) else (
-        f"{key} ({', '.join(map(str, known))})"
+    return (
+        f"{key} ({known[1]:g} to {known[2]:g})"
+        if len(known) == 3 and not isinstance(known[0], str)
+        else (f"{key} ({', '.join(map(str, known))})")
     )
 
 
@@ -133,20 +141,54 @@ def _design(**options: Range) -> Callable[[Callable[[Table, Measures, Options], 
     return enter
 
 
-def _gore_waist(t: Table, back: bool) -> list[tuple[str, str]]:
+def _gores(t: Table, ring: float, circle: float, length: float, top: Point, tilt: float) -> None:
+    """Four sectors of a share of a circle, sewn to a ring around an edge of length ``ring`` [m] at ``top``, its y and z; each
+    has two pieces there. They begin tilted outwards by ``tilt`` [degrees]."""
+    half, inner = 0.25 * math.pi * circle, ring / (2.0 * math.pi * circle)
+
+    def arc(radius: float, first: float, last: float) -> tuple[Point, tuple[Point, Point]]:
+        """Start and control points of an arc below the centre, between two angles from straight down."""
+        a, b, k = first, last, 4.0 / 3.0 * math.tan(0.25 * (last - first)) * radius
+        start, end = (radius * math.sin(a), -radius * math.cos(a)), (radius * math.sin(b), -radius * math.cos(b))
+        return start, (
+            (start[0] + k * math.cos(a), start[1] + k * math.sin(a)),
+            (end[0] - k * math.cos(b), end[1] - k * math.sin(b)),
+        )
+
+    low = inner + length
+    outline = [
+        Side("hem0", *arc(low, -half, 0.0)),
+        Side("hem1", *arc(low, 0.0, half)),
+        Side("ahead", arc(low, half, 0.0)[0]),
+        Side("waist0", *arc(inner, half, 0.0)),
+        Side("waist1", *arc(inner, 0.0, -half)),
+        Side("behind", arc(inner, -half, 0.0)[0]),
+    ]
+    names = ["gore_back_right", "gore_front_right", "gore_front_left", "gore_back_left"]
+    for name, around in zip(names, (-135.0, -45.0, 45.0, 135.0), strict=True):
+        angles = (-tilt, around, 0.0)
+        out = np.array([math.sin(math.radians(around)), 0.0, math.cos(math.radians(around))])
+        waist = Rotation.from_euler("xyz", angles, degrees=True).apply([0.0, -inner, 0.0])
+        at = (ring / (2.0 * math.pi) + 0.02) * out + [0.0, *top] - waist
+        t.draw(name, outline, angles, (float(at[0]), float(at[1]), float(at[2])))
+    for name, other in zip(names, names[1:] + names[:1], strict=True):
+        t.sew((name, "ahead"), (other, "behind"))
+
+
+def _gore_waist(t: Table, back: bool) -> list[Key]:
     """The waist of the gores in front or behind, as they are seen."""
     names = ("gore_back_left", "gore_back_right") if back else ("gore_front_right", "gore_front_left")
     return [side for name in names for side in t.keys(name, "waist")]
 
 
-def _leg_waist(t: Table, back: bool) -> list[tuple[str, str]]:
+def _leg_waist(t: Table, back: bool) -> list[Key]:
     """The waist of trousers in front or behind, as it is seen."""
     names = ("left_leg_back", "right_leg_back") if back else ("right_leg_front", "left_leg_front")
     return [side for name in names for side in t.keys(name, "waist")]
 
 
 def _neck(o: Options, strap: float = 1.0, width: float | None = None) -> Neck:
-    return Neck(o.depth, o.width if width is None else width, strap, o.word("shape"))
+    return Neck(o.depth, o.width if width is None else width, strap, o.shape)
 
 
 def _sleeved(t: Table, m: Measures, o: Options, puff: float = 1.01) -> None:
@@ -158,7 +200,7 @@ def _sleeved(t: Table, m: Measures, o: Options, puff: float = 1.01) -> None:
     ease=(0.08, 0.02, 0.4),
     length=(0.2, 0.05, 0.5),
     depth=(0.32, 0.15, 0.5),
-    width=(0.35, 0.1, 0.5),
+    width=(0.35, 0.1, 0.45),
     strap=(0.75, 0.7, 0.95),
     shape=("round", "v"),
     fit=(0.3, 0.0, 1.0),
@@ -208,7 +250,7 @@ def _collar(t: Table, m: Measures, height: float) -> None:
 def _shirt(t: Table, m: Measures, o: Options) -> None:
     torso(t, m, o.ease, o.length, Neck(o.depth, 0.04), o.fit)
     sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff if o.cuff >= 0.02 else 0.0)
-    if o.word("collar") == "stand":
+    if o.collar == "stand":
         _collar(t, m, 0.035)
 
 
@@ -261,6 +303,9 @@ _BODICE: dict[str, Range] = {
 }
 
 
+_STRAIGHT = {key: own for key, own in _BODICE.items() if key != "puff"}
+
+
 @_design(**_BODICE)
 def _bodice(t: Table, m: Measures, o: Options) -> None:
     bodice(t, m, o.ease, _neck(o))
@@ -289,22 +334,12 @@ def _dress(t: Table, m: Measures, o: Options) -> None:
 def _swing(t: Table, m: Measures, o: Options) -> None:
     ring = 4.0 * sum(bodice(t, m, o.ease, _neck(o)))
     _sleeved(t, m, o, o.puff)
-    gores(t, ring, o.circle, o.length * m.waist_height, (m.waist_height, 0.5 * (m.front + m.back)), 35.0 * o.circle)
+    _gores(t, ring, o.circle, o.length * m.waist_height, (m.waist_height, 0.5 * (m.front + m.back)), 35.0 * o.circle)
     for back, name in enumerate(("front", "back")):
         t.sew_all(t.keys(name, "hem"), _gore_waist(t, bool(back)))
 
 
-@_design(
-    ease=(0.12, 0.05, 0.5),
-    length=(0.5, 0.25, 0.95),
-    sleeve=(0.0, 0.0, 1.0),
-    wide=(1.0, 0.7, 2.0),
-    depth=(0.22, 0.12, 0.45),
-    width=(0.2, 0.0, 0.5),
-    shape=("round", "v"),
-    fit=(0.4, 0.0, 1.0),
-    flare=(0.25, 0.0, 1.0),
-)
+@_design(**_STRAIGHT, length=(0.5, 0.25, 0.95), fit=(0.4, 0.0, 1.0), flare=(0.25, 0.0, 1.0))
 def _shift(t: Table, m: Measures, o: Options) -> None:
     torso(t, m, o.ease, o.length, _neck(o), o.fit, o.flare)
     _sleeved(t, m, o)
@@ -337,7 +372,7 @@ def _pencil(t: Table, m: Measures, o: Options) -> None:
 @_design(length=(0.5, 0.2, 0.95), circle=(1.0, 0.3, 1.2), band=(0.035, 0.03, 0.08))
 def _circle(t: Table, m: Measures, o: Options) -> None:
     middle = 0.5 * (m.front + m.back)
-    gores(t, 1.02 * m.waist, o.circle, o.length * m.waist_height, (m.waist_height, middle), 35.0 * o.circle)
+    _gores(t, 1.02 * m.waist, o.circle, o.length * m.waist_height, (m.waist_height, middle), 35.0 * o.circle)
     band(t, m, {back: _gore_waist(t, back) for back in (False, True)}, o.band, m.waist_height + o.band)
 
 
@@ -364,7 +399,8 @@ def _tiered(t: Table, m: Measures, o: Options) -> None:
 
 def _trousers_with_band(t: Table, m: Measures, o: Options, knee: float, hem: float) -> None:
     top = m.waist_height + o.rise - o.band
-    legs(t, m, Leg(o.ease, knee, hem, o.length, top, _quarter(float(np.interp(top, [m.hip_height, m.waist_height], [m.hips, m.waist])))))
+    waist = float(np.interp(top, [m.hip_height, m.waist_height], [m.hips, m.waist]))
+    legs(t, m, Leg(o.ease, knee, hem, o.length, top, _quarter(waist)))
     band(t, m, {back: _leg_waist(t, back) for back in (False, True)}, o.band, top + o.band)
 
 
@@ -410,4 +446,4 @@ def _poncho(t: Table, m: Measures, o: Options) -> None:
 @_design(length=(0.1, -0.1, 0.6), circle=(0.8, 0.6, 1.0), ease=(0.25, 0.1, 0.5))
 def _cape(t: Table, m: Measures, o: Options) -> None:
     long = m.neck_height - m.waist_height * (1.0 - o.length)
-    gores(t, m.neck * (1.0 + o.ease), o.circle, long, (m.neck_height + 0.01, m.shoulder[2]), 45.0)
+    _gores(t, m.neck * (1.0 + o.ease), o.circle, long, (m.neck_height + 0.01, m.shoulder[2]), 45.0)

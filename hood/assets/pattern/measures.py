@@ -77,9 +77,10 @@ def cuts(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray, normal: np.
     mixed = faces[np.ptp((side > 0)[faces].astype(np.int8), axis=1) > 0]
     edges = np.sort(mixed[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
     edges = edges[(side[edges[..., 0]] > 0) != (side[edges[..., 1]] > 0)]  # two of every face
-    own, number = np.unique(edges, axis=0, return_inverse=True)
-    if not len(own):
+    if not len(edges):
         return []
+    codes, number = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)
+    own = np.stack(np.divmod(codes, len(vertices)), axis=1)
     share = side[own[:, 0]] / (side[own[:, 0]] - side[own[:, 1]])
     points = vertices[own[:, 0]] + share[:, None] * (vertices[own[:, 1]] - vertices[own[:, 0]])
     label = topology.connected_components(len(own), number.reshape(-1, 2))
@@ -157,7 +158,9 @@ class _Tape:
 
     def top(self, x: float) -> np.ndarray:
         """The highest point (3,) of the surface below the head, so far to the left."""
-        points = np.concatenate(cuts(self.vertices, self.faces, np.array([x, 0.0, 0.0]), _LEFT))
+        curves = cuts(self.vertices, self.faces, np.array([x, 0.0, 0.0]), _LEFT)
+        # Ears and cheeks are curves above the neck.
+        points = np.concatenate([one for one in curves if one[:, 1].min() < self.joints[_NECK, 1]])
         points = points[points[:, 1] < self.joints[_HEAD, 1]]
         return np.asarray(points[points[:, 1].argmax()])
 
@@ -179,7 +182,7 @@ class _Tape:
         crotch = self.lowest(joints[_KNEE, 1], joints[_PELVIS, 1], "crotch")
         underarm = self.lowest(waist_height, joints[_SHOULDER, 1], "underarm")
         hip_height, hips = self.extreme(crotch + 0.02, waist_height - 0.02, 1.0)
-        _, chest = self.extreme(waist_height + 0.02, underarm - 0.005, 1.0)
+        _, chest = self.extreme(waist_height + 0.02, underarm - 0.05, 1.0)
         _, neck = self.extreme(joints[_NECK, 1], joints[_HEAD, 1], -1.0)
         _, head = self.extreme(joints[_HEAD, 1] + 0.03, self.vertices[:, 1].max() - 0.03, 1.0)
         side, tip = self.top(_NECK_WIDTH * neck), self.top(float(joints[_SHOULDER, 0]))

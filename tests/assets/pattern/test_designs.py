@@ -39,7 +39,10 @@ def corners(name: str) -> list[dict[str, Any]]:
     low = {key: own[1] for key, own in known.items() if len(own) > 1}
     high = {key: own[-1] for key, own in known.items()}
     some = [
-        {key: str(rng.choice(own)) if isinstance(own[0], str) else float(rng.uniform(own[1], own[2])) for key, own in known.items()}
+        {
+            key: str(rng.choice(own)) if isinstance(own[0], str) else float(rng.uniform(own[1], own[2]))
+            for key, own in known.items()
+        }
         for _ in range(3)
     ]
     return [{}, low, high, *some]
