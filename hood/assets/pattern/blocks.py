@@ -212,6 +212,27 @@ def upper_half(m: Measures, back: bool, ease: float, neck: Neck) -> tuple[list[S
     return [Side("armhole", armpit, armhole), Side("shoulder", _point(tip)), Side("neck", _point(side), curve)], low
 
 
+def _fitted(below: Point, low: Point, high: Point, waist: Point, fit: float) -> tuple[Point, ...]:
+    """Control points of a side seam that goes on from ``below`` at ``low`` and comes nearer to the waist on its way up; none
+    where the waist is not well between its ends."""
+    rise, share = high[1] - low[1], (waist[1] - low[1]) / (high[1] - low[1])
+    if fit == 0.0 or not 0.25 < share < 0.75:
+        return ()
+    first = low[0] + (low[0] - below[0]) / max(low[1] - below[1], 1e-9) * rise / 3.0
+    level = (1.0 - share) * low[0] + share * high[0]
+    weights = [(1.0 - share) ** 3, 3.0 * (1.0 - share) ** 2 * share, 3.0 * (1.0 - share) * share**2, share**3]
+    rest = weights[0] * low[0] + weights[1] * first + weights[3] * high[0]
+    second = (level + fit * min(waist[0] - level, 0.0) - rest) / weights[2]
+    return (first, low[1] + rise / 3.0), (second, low[1] + 2.0 * rise / 3.0)
+
+
+def _onward(below: Point, low: Point, high: Point) -> tuple[Point, Point]:
+    """Control points of a side that goes on from ``below`` at ``low`` and bends to ``high``, where a waist is."""
+    rise = high[1] - low[1]
+    lean = (low[0] - below[0]) / (low[1] - below[1])
+    return (low[0] + 0.35 * rise * lean, low[1] + 0.35 * rise), (high[0] + 0.3 * (low[0] - high[0]), high[1] - 0.35 * rise)
+
+
 def _dart(width: float) -> float:
     """Width [m] of a dart of about that width; none where it is too narrow."""
     return 0.0 if width < 0.01 else min(width, 0.035)
@@ -232,9 +253,7 @@ def torso(t: Table, m: Measures, ease: float, length: float, neck: Neck, fit: fl
         if hem < m.hip_height - 0.06:
             sides = [Side("side0", low)]
             low = (max(wide, low[0] + (armpit[0] - low[0]) * (m.hip_height - hem) / (armpit[1] - hem)), m.hip_height)
-        share = (m.waist_height - low[1]) / (armpit[1] - low[1])
-        waist = 0.5 * (low[0] + armpit[0]) - fit * (0.5 * (low[0] + armpit[0]) - 0.25 * m.waist * (1.0 + ease))
-        curve = ((2.0 * waist - 0.5 * (low[0] + armpit[0]), m.waist_height),) if fit and 0.2 < share < 0.8 else ()
+        curve = _fitted(sides[0].start if sides else low, low, armpit, (0.25 * m.waist * (1.0 + ease), m.waist_height), fit)
         half = [Side("hem", (0.0, hem)), *sides, Side("side1", low, curve), *upper]
         t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
     t.sew_keys("front", "back", ["side", "shoulder"])
@@ -340,10 +359,11 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
     side, low = inner + outer + dart, hip * (1.0 + flare)
     hip = max(hip, side + (low - side) * (top - m.hip_height) / (top - hem))
     apex = (inner + 0.5 * dart, top - 0.6 * (top - m.hip_height))
+    corner = (low, hem + 0.15 * (low - hip))
     half = [
         Side("hem", (0.0, hem), ((0.6 * low, hem),)),
-        Side("side0", (low, hem + 0.15 * (low - hip))),
-        Side("side1", (hip, m.hip_height), ((hip, m.hip_height + 0.55 * (top - m.hip_height)),) if flare < 0.3 else ()),
+        Side("side0", corner),
+        Side("side1", (hip, m.hip_height), _onward(corner, (hip, m.hip_height), (side, top)) if flare < 0.3 else ()),
         Side("waist1", (side, top)),
         *([Side("dart_a", (inner + dart, top)), Side("dart_b", apex)] if dart else []),
         Side("waist0", (inner, top)),
@@ -397,13 +417,13 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
 
         fork = crotch
         if back:
-            fork = float(brentq(lambda height, own=inseam: length(height) - own, joint[1] + 0.01, crotch + 0.02, xtol=1e-7))
+            fork = float(brentq(lambda height, own=inseam: length(height) - own, joint[1] + 0.01, crotch + 0.06, xtol=1e-7))
         inseam = length(fork)
         low_end = Side("outer0", (hem_out, low)), Side("outer1", (outer, m.knee_height))
         sides = [Side("hem", (hem_out - wide - more, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
         seat = fork + max(0.08, 1.1 * reach)
         sides += [
-            Side("outer2", (hip, m.hip_height), ((hip, m.hip_height + 0.5 * depth),)),
+            Side("outer2", (hip, m.hip_height), _onward(sides[-1].start, (hip, m.hip_height), side)),
             *_slanted(middle, side, leg.pieces, depth),
             Side("centre", middle),
             Side("crotch", (0.0, seat), ((0.0, fork + 0.3 * (seat - fork)), (-0.35 * reach, fork))),

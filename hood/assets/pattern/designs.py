@@ -407,12 +407,12 @@ def _trousers_with_band(t: Table, m: Measures, o: Options, knee: float, hem: flo
 _LEGS: dict[str, Range] = {"rise": (-0.03, -0.07, 0.0), "band": (0.035, 0.03, 0.05)}
 
 
-@_design(**_LEGS, ease=(0.06, 0.02, 0.3), length=(0.95, 0.65, 1.0), knee=(0.3, 0.1, 1.0), hem=(0.95, 0.7, 1.8))
+@_design(**_LEGS, ease=(0.06, 0.02, 0.3), length=(0.93, 0.65, 0.97), knee=(0.3, 0.1, 1.0), hem=(0.95, 0.7, 1.8))
 def _trousers(t: Table, m: Measures, o: Options) -> None:
     _trousers_with_band(t, m, o, o.knee, o.hem)
 
 
-@_design(**_LEGS, ease=(0.01, -0.03, 0.06), length=(0.93, 0.65, 0.96), knee=(0.05, 0.0, 0.15), hem=(1.1, 1.0, 1.3))
+@_design(**_LEGS, ease=(0.01, -0.03, 0.06), length=(0.85, 0.5, 0.88), knee=(0.05, 0.0, 0.15), hem=(1.1, 1.0, 1.3))
 def _leggings(t: Table, m: Measures, o: Options) -> None:
     _trousers_with_band(t, m, o, o.knee, o.hem * m.ankle / m.knee)
 
@@ -422,7 +422,7 @@ def _shorts(t: Table, m: Measures, o: Options) -> None:
     _trousers_with_band(t, m, o, 0.4, o.hem)
 
 
-@_design(**_BODICE, length=(0.9, 0.12, 1.0), knee=(0.4, 0.15, 1.0), hem=(1.0, 0.7, 1.6))
+@_design(**_BODICE, length=(0.9, 0.12, 0.97), knee=(0.4, 0.15, 1.0), hem=(1.0, 0.7, 1.6))
 def _jumpsuit(t: Table, m: Measures, o: Options) -> None:
     pieces = bodice(t, m, o.ease, _neck(o))
     _sleeved(t, m, o, o.puff)
