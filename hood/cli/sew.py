@@ -1,4 +1,4 @@
-"""``hood sew FILE``: a sewing pattern in, the garment that it makes on a body out, judged before it is written."""
+"""``hood sew FILE`` or ``hood sew design:NAME``: a sewing pattern in; out the garment that it makes on a body, judged."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from hood.app.common import prepare_folder, require_package, split_words
 from hood.app.scene.fabrics import fabric_named
 from hood.app.scene.garments import shape_coefficients
 from hood.app.scene.placing import AUTO, arm_angle
-from hood.app.settings.compose import ConfigError, options, shown
+from hood.app.settings.compose import ConfigError, options, plain, shown
+from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.library import unknown
 from hood.assets.garment.binding import PosedBody, bind_posed
 from hood.assets.garment.garment import Garment, save_garment
-from hood.assets.pattern.pattern import Pattern, read_pattern
+from hood.assets.pattern.designs import DESIGNS, draft
+from hood.assets.pattern.measures import measure_body
+from hood.assets.pattern.pattern import Pattern, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.media.exports.sequences import write_obj
 from hood.media.film import Film
@@ -30,6 +33,8 @@ from hood.rollouts.sewn import Sewn
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
+#: How the word of an own design begins.
+_DESIGN = "design:"
 _WIDTH, _HEIGHT = 420, 560
 #: Between panels in the picture [m], and pixels for its title.
 _MARGIN, _TITLE = 0.02, 36
@@ -40,20 +45,25 @@ def run(arguments: Sequence[str]) -> int:
     words, config = split_words("sew", arguments)
     if len(words) != 1:
         given = f"{len(words)} files are given" if words else "no file is given"
-        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz")
-    path, edge = Path(words[0]).expanduser(), _number(config, "edge", _FINEST, _COARSEST)
+        raise ConfigError(
+            f"{given}: write one, hood sew specification.json output=shirt.npz, or a design, hood sew design:tshirt"
+        )
+    word, edge = words[0], _number(config, "edge", _FINEST, _COARSEST)
     gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
     if angle is None and str(config.pose) != AUTO:
         raise ConfigError(f"pose={shown(config.pose)}: give tpose, apose, degrees of the arms below the T-pose, or auto")
     if str(config.material) not in options("material"):
         raise ConfigError(unknown("fabric", str(config.material), options("material")))
     material = fabric_named(str(config.material))
-    pattern = read_pattern(path, gathers)
+    pattern, body, betas = _pattern(word, config, gathers)
     target = _target(config, pattern)
-    picture = _picture(config, target)
-    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
-    sheet = sheet_of(pattern, edge, str(path))
+    picture, written = _picture(config, target), _specification(config)
+    sheet = sheet_of(pattern, edge, word)
     prepare_folder(target.parent)
+    if written is not None:
+        prepare_folder(written.parent)
+        write_pattern(written, pattern)
+        print(f"written: {written}")
     posed, sewn = sew(pattern, sheet, body, betas, material, angle)
     worn = _garment(pattern, sheet, sewn)
     print("\n".join(_report(pattern, sheet, sewn)))
@@ -72,6 +82,32 @@ def run(arguments: Sequence[str]) -> int:
     save_garment(target, bind_posed(worn, posed))
     print(f"written: {target}")
     return 0
+
+
+def _pattern(word: str, config: DictConfig, gathers: float) -> tuple[Pattern, Body, np.ndarray]:
+    """The pattern of a file, or a design made to the measures of the body; that body, and its shape coefficients."""
+    chosen, name = plain(config.design), word.removeprefix(_DESIGN)
+    if chosen is not None and (name == word or not isinstance(chosen, dict)):
+        example = "{length:0.3,ease:0.1}"
+        raise ConfigError(f"design={shown(config.design)}: give options in braces, hood sew design:tshirt 'design={example}'")
+    if name != word and name not in DESIGNS:
+        raise ConfigError(unknown("design", name, DESIGNS))
+    betas = shape_coefficients(config.betas)
+    if name == word:
+        return read_pattern(Path(word).expanduser(), gathers), load_body(str(config.body)), betas
+    body = load_body(str(config.body))
+    vertices, joints = body.shaped(betas)
+    return draft(name, measure_body(vertices, body.faces, joints), chosen), body, betas
+
+
+def _specification(config: DictConfig) -> Path | None:
+    """Where the pattern itself is written; None: nowhere."""
+    if config.pattern is None:
+        return None
+    path = Path(str(config.pattern)).expanduser()
+    if path.suffix != ".json":
+        raise ConfigError(f"pattern={path}: patterns are .json files")
+    return path
 
 
 def _number(config: DictConfig, key: str, low: float, high: float) -> float:

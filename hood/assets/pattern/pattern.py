@@ -6,6 +6,7 @@ Lengths are metres here, whatever the unit of the file; y is up, z forward, and 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
@@ -296,3 +298,71 @@ def _check_stitches(where: str, pattern: Pattern, most: float) -> None:
                 for (name, place), length in zip((stitch.first, stitch.second), lengths, strict=True)
             )
             raise ValueError(f"{where}: stitch {number} joins {sides}, more than {most:g} times as long; change one of them")
+
+
+def check_pattern(where: str, pattern: Pattern, most_gathered: float = MOST_GATHERED) -> None:
+    """Raise ValueError, as :func:`read_pattern` does, unless a pattern that was made in memory can be sewn."""
+    for name, panel in pattern.panels.items():
+        there = f"{where}: panel {name!r}"
+        short = next((k for k, edge in enumerate(panel.edges) if edge.length < _SHORTEST), None)
+        if short is not None:
+            raise ValueError(f"{there}, edge {panel.numbers[short]} has no length; merge its two vertices")
+        _check_outline(there, list(panel.edges), list(panel.numbers))
+    _check_stitches(where, pattern, most_gathered)
+
+
+def write_pattern(path: Path, pattern: Pattern) -> None:
+    """Write a GarmentCode ``specification.json`` in centimetres, which :func:`read_pattern` reads back.
+
+    Edges stand in the order of the loop; an existing file is replaced at once or not at all.
+
+    Raises:
+        ValueError: an edge whose curve has more than two control points, which the format has not.
+    """
+    panels = {}
+    for name, panel in pattern.panels.items():
+        edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of turns for which several triples of angles stand
+            angles = Rotation.from_matrix(panel.rotation).as_euler("xyz", degrees=True)
+        panels[name] = {
+            "translation": _rounded(100.0 * panel.translation),
+            "rotation": _rounded(angles),
+            "vertices": [_rounded(100.0 * edge.start) for edge in panel.edges],
+            "edges": edges,
+            "label": panel.label,
+        }
+    stitches: list[list[Any]] = []
+    for stitch in pattern.stitches:
+        sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
+        stitches.append([*sides, "right_wrong"] if stitch.same else sides)
+    properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
+    content = {
+        "pattern": {"panels": panels, "stitches": stitches, "panel_order": list(panels)},
+        "parameters": {},
+        "parameter_order": [],
+        "properties": {**properties, "normalized_edge_loops": True},
+    }
+    write_atomically(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """Numbers as they are written: a picometre is less than their rounding."""
+    return [round(float(value), 10) + 0.0 for value in values]
+
+
+def _written(where: str, number: int, count: int, edge: Edge) -> dict[str, Any]:
+    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count]}
+    if edge.arc is not None:
+        radius, large, right = edge.arc
+        content["curvature"] = {"type": "circle", "params": [100.0 * radius, int(large), int(right)]}
+    elif len(edge.curve):
+        if len(edge.curve) > 2:
+            raise ValueError(f"{where} has {len(edge.curve)} control points; the format has one or two")
+        way = edge.end - edge.start
+        axes = np.stack([way, [-way[1], way[0]]], axis=1) / float(way @ way)
+        params = [[float(value) for value in point] for point in (edge.curve - edge.start) @ axes]
+        content["curvature"] = {"type": "quadratic" if len(params) == 1 else "cubic", "params": params}
+    if edge.label:
+        content["label"] = edge.label
+    return content
