@@ -16,10 +16,8 @@ from hood.app.settings.compose import ConfigError, options, plain, shown
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.library import unknown
-from hood.assets.garment.binding import PosedBody, bind_posed, posed_body
+from hood.assets.garment.binding import PosedBody, bind_posed
 from hood.assets.garment.garment import Garment, save_garment
-from hood.assets.material import Material
-from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.designs import DESIGNS, draft
 from hood.assets.pattern.measures import measure_body
 from hood.assets.pattern.pattern import Pattern, read_pattern, write_pattern
@@ -29,17 +27,14 @@ from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.sewing import Sewn, sew_around
+from hood.rollouts.sewing import sew
+from hood.rollouts.sewn import Sewn
 
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
 #: How the word of an own design begins.
 _DESIGN = "design:"
-#: Arms of the poses of the T and the A, degrees below the former.
-_TPOSE, _APOSE = 0.0, 45.0
-#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
-_BESIDE, _HIGH = 0.19, 0.9
 _WIDTH, _HEIGHT = 420, 560
 #: Between panels in the picture [m], and pixels for its title.
 _MARGIN, _TITLE = 0.02, 36
@@ -69,11 +64,7 @@ def run(arguments: Sequence[str]) -> int:
         prepare_folder(written.parent)
         write_pattern(written, pattern)
         print(f"written: {written}")
-    angles = [angle] if angle is not None else ([_APOSE, _TPOSE] if _sleeved(pattern) else [_TPOSE, _APOSE])
-    found = [_attempt(sheet, posed_body(body, arms_down(angles[0]), 0, betas), material)]
-    if found[0][1].figures.faults and len(angles) > 1:
-        found.append(_attempt(sheet, posed_body(body, arms_down(angles[1]), 0, betas), material))
-    posed, sewn = min(found, key=lambda one: len(one[1].figures.faults))
+    posed, sewn = sew(pattern, sheet, body, betas, material, angle)
     worn = _garment(pattern, sheet, sewn)
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:
@@ -143,19 +134,6 @@ def _picture(config: DictConfig, target: Path) -> Path | None:
         raise ConfigError(f"sheet={word}: sheets are .png files; give one, auto or none")
     require_package("PIL", "Pillow", "pictures", "the sheet of hood sew (sheet=none draws none)")
     return picture
-
-
-def _sleeved(pattern: Pattern) -> bool:
-    """Whether a panel is one of a sleeve, by its label or its place."""
-    for panel in pattern.panels.values():
-        middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
-        if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
-            return True
-    return False
-
-
-def _attempt(sheet: PatternSheet, posed: PosedBody, material: Material) -> tuple[PosedBody, Sewn]:
-    return posed, sew_around(sheet, posed, material)
 
 
 def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:
