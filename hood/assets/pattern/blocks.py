@@ -7,7 +7,7 @@ have keys; in a panel that lies across the middle of the body they begin with th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -82,11 +82,8 @@ class Table:
         middle = {key: float(panel.edges[self._keys[name].index(key)].at(np.array([0.5]))[0, 0]) for key in found}
         return [(name, key) for key in sorted(found, key=lambda key: middle[key])]
 
-    def edge(self, side: Key) -> Edge:
-        return self.panels[side[0]].edges[self._keys[side[0]].index(side[1])]
-
     def lengths(self, sides: Sequence[Key]) -> list[float]:
-        return [self.edge(side).length for side in sides]
+        return [self.panels[name].edges[self._keys[name].index(key)].length for name, key in sides]
 
     def sew(self, first: Key, second: Key, same: bool = False) -> None:
         ends = [(name, self._keys[name].index(key)) for name, key in (first, second)]
@@ -181,7 +178,6 @@ def tiers(
             names[back] = name = f"tier{number}_{'back' if back else 'front'}"
             pieces = [gathers * part for part in t.lengths(above)]
             strip(t, name, pieces, [sum(pieces)], length / count, top - number * length / count, place(m, back))
-            # A row of one piece has the key of an upper rim.
             t.sew_all(above, t.keys(name, "above") or t.keys(name, "top"))
         t.sew_keys(names[False], names[True], ["side"])
         edges = {back: t.keys(name, "below") for back, name in names.items()}
@@ -196,15 +192,17 @@ class Neck(NamedTuple):
     shape: str = "round"
 
 
-def upper_half(m: Measures, back: bool, ease: float, neck: Neck) -> tuple[list[Side], Point]:
-    """Half of a bodice from the underarm to the middle of the neckline: armhole, shoulder, neckline; and where that ends."""
+def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: Point | None = None) -> tuple[list[Side], Point]:
+    """Half of a bodice from the underarm to the middle of the neckline: armhole, shoulder, neckline; and where that ends. The
+    armhole begins across the side seam, which comes from ``below``."""
     over = m.back_length if back else float(np.clip(m.front_length, m.back_length - 0.01, m.back_length + 0.025))
     top, slope = m.waist_height + over, max(m.neck_height - m.shoulder_height, 0.01)
     inner, outer = np.array([m.neck_width, top]), np.array([0.5 * m.shoulder_width, top - slope])
     side, tip = inner + neck.width * (outer - inner), inner + neck.strap * (outer - inner)
     armpit = (0.25 * m.chest * (1.0 + ease), m.underarm_height - 0.02 - 0.1 * ease)
     across = min(tip[0], armpit[0]) - 0.02 * neck.strap
-    armhole = ((across, armpit[1]), (across, 0.5 * (armpit[1] + tip[1])))
+    lean = 0.0 if below is None else (armpit[0] - below[0]) / (armpit[1] - below[1])
+    armhole = ((across, armpit[1] + lean * (armpit[0] - across)), (across, 0.5 * (armpit[1] + tip[1])))
     depth = 0.02 + 0.05 * neck.width if back else neck.depth * over
     low = (0.0, float(min(top - depth, side[1] - 0.01)))
     round_ = ((0.6 if back else 0.9) * float(side[0]), low[1])
@@ -213,8 +211,7 @@ def upper_half(m: Measures, back: bool, ease: float, neck: Neck) -> tuple[list[S
 
 
 def _fitted(below: Point, low: Point, high: Point, waist: Point, fit: float) -> tuple[Point, ...]:
-    """Control points of a side seam that goes on from ``below`` at ``low`` and comes nearer to the waist on its way up; none
-    where the waist is not well between its ends."""
+    """Control points of a side seam that goes on from ``below`` and comes nearer to the waist, if that is well between its ends."""
     rise, share = high[1] - low[1], (waist[1] - low[1]) / (high[1] - low[1])
     if fit == 0.0 or not 0.25 < share < 0.75:
         return ()
@@ -247,13 +244,13 @@ def torso(t: Table, m: Measures, ease: float, length: float, neck: Neck, fit: fl
     hem = m.waist_height * (1.0 - length)
     wide = max(0.25 * m.chest * (1.0 + ease), 0.25 * m.hips * (1.0 + max(ease, 0.04)) if hem < m.waist_height - 0.08 else 0.0)
     for back in (False, True):
-        upper, end = upper_half(m, back, ease, neck)
-        armpit = upper[0].start
+        armpit = upper_half(m, back, ease, neck)[0][0].start
         low, sides = (wide * (1.0 + flare), hem), []
         if hem < m.hip_height - 0.06:
             sides = [Side("side0", low)]
             low = (max(wide, low[0] + (armpit[0] - low[0]) * (m.hip_height - hem) / (armpit[1] - hem)), m.hip_height)
         curve = _fitted(sides[0].start if sides else low, low, armpit, (0.25 * m.waist * (1.0 + ease), m.waist_height), fit)
+        upper, end = upper_half(m, back, ease, neck, curve[-1] if curve else low)
         half = [Side("hem", (0.0, hem)), *sides, Side("side1", low, curve), *upper]
         t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
     t.sew_keys("front", "back", ["side", "shoulder"])
@@ -264,7 +261,7 @@ def bodice(t: Table, m: Measures, ease: float, neck: Neck) -> tuple[float, float
     waist, chest = 0.25 * m.waist * (1.0 + max(ease, 0.04)), 0.25 * m.chest * (1.0 + ease)
     dart, inner = _dart(0.6 * (chest - waist)), 0.5 * waist
     for back in (False, True):
-        upper, end = upper_half(m, back, ease, neck)
+        upper, end = upper_half(m, back, ease, neck, (waist + dart, m.waist_height))
         low, apex = m.waist_height, m.waist_height + 0.7 * (upper[0].start[1] - m.waist_height)
         half = [
             Side("hem0", (0.0, low)),
@@ -406,19 +403,14 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         more = 0.0 if bends else (1.0 - share) * (reach - 0.055 * m.hips)
         joint = (outer - knee, m.knee_height) if bends else (hem_out - wide - more, low)
 
-        def inner(height: float, joint: Point = joint, reach: float = reach) -> Side:
-            rise = height - joint[1]
-            bend = (joint[0] - 0.25 * (joint[0] + reach), joint[1] + 0.55 * rise)
-            return Side("inner1", (-reach, height), (bend,))
-
-        def length(height: float, joint: Point = joint, make: Callable[[float], Side] = inner) -> float:
-            own = make(height)
-            return Edge(np.array(own.start), np.array(joint), np.array(own.curve)).length
+        def inner(height: float, joint: Point = joint, reach: float = reach) -> Edge:
+            bend = (joint[0] - 0.25 * (joint[0] + reach), joint[1] + 0.55 * (height - joint[1]))
+            return Edge(np.array([-reach, height]), np.array(joint), np.array([bend]))
 
         fork = crotch
         if back:
-            fork = float(brentq(lambda height, own=inseam: length(height) - own, joint[1] + 0.01, crotch + 0.06, xtol=1e-7))
-        inseam = length(fork)
+            fork = float(brentq(lambda at, own=inseam: inner(at).length - own, joint[1] + 0.01, crotch + 0.06, xtol=1e-7))
+        inseam = inner(fork).length
         low_end = Side("outer0", (hem_out, low)), Side("outer1", (outer, m.knee_height))
         sides = [Side("hem", (hem_out - wide - more, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
         seat = fork + max(0.08, 1.1 * reach)
@@ -427,13 +419,14 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
             *_slanted(middle, side, leg.pieces, depth),
             Side("centre", middle),
             Side("crotch", (0.0, seat), ((0.0, fork + 0.3 * (seat - fork)), (-0.35 * reach, fork))),
-            inner(fork),
+            Side("inner1", (-reach, fork), (_point(inner(fork).curve[0]),)),
         ]
         if bends:
             sides.append(Side("inner0", joint))
         own, name = ("right", "back") if back else ("left", "front")
         angles, at = place(m, back)
-        t.draw(f"{own}_leg_{name}", sides, angles, (-0.015 if back else 0.015, *at[1:]), "leg")
+        aside = max(m.stance - outer + 0.5 * knee, 0.015)  # around the leg of a body that stands with its legs apart
+        t.draw(f"{own}_leg_{name}", sides, angles, (-aside if back else aside, *at[1:]), "leg")
         t.mirror(f"{own}_leg_{name}", f"{_other(own)}_leg_{name}")
     for own in ("left", "right"):
         t.sew_keys(f"{own}_leg_front", f"{own}_leg_back", ["outer", "inner"])

@@ -26,7 +26,7 @@ class Measures:
         neck_height: of the side of the neck on the shoulder, which ends at ``shoulder_height``.
         shoulder_width: from one point of the shoulder to the other; ``arm_length`` from there to the wrist.
         front_length: from the side of the neck over the chest to the waist, ``back_length`` over the back.
-        shoulder: (x, y, z) of the joint of the left arm.
+        shoulder: (x, y, z) of the joint of the left arm; ``stance``: x of the left knee.
         front: the greatest z of the trunk; ``back`` the least.
     """
 
@@ -55,6 +55,7 @@ class Measures:
     front_length: float
     back_length: float
     shoulder: tuple[float, float, float]
+    stance: float
     front: float
     back: float
 
@@ -218,6 +219,7 @@ class _Tape:
             front_length=self.over(side, waist_height, 1.0),
             back_length=self.over(side, waist_height, -1.0),
             shoulder=(float(joints[_SHOULDER, 0]), float(joints[_SHOULDER, 1]), float(joints[_SHOULDER, 2])),
+            stance=float(joints[_KNEE, 0]),
             front=float(depth.max()),
             back=float(depth.min()),
         )
