@@ -23,6 +23,8 @@ Place = tuple[float, float, float]
 Key = tuple[str, str]
 #: Panels begin so far [m] before and behind the trunk; those of a sleeve from the skin of the arm.
 _APART, _FROM_ARM = 0.05, 0.035
+#: Sleeves are longer than the arm by so much [m], which a raised arm takes.
+_RAISED = 0.03
 #: Degrees of the arms below the T-pose, for which sleeves are placed.
 ARMS = 45.0
 #: Labels of edges as GarmentCode has them, by the beginning of their keys; {} is the side of the body.
@@ -211,7 +213,7 @@ def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: Point | 
 
 
 def _fitted(below: Point, low: Point, high: Point, waist: Point, fit: float) -> tuple[Point, ...]:
-    """Control points of a side seam that goes on from ``below`` and comes nearer to the waist, if that is well between its ends."""
+    """Control points of a side seam that goes on from ``below`` and comes nearer to the waist where that is well between."""
     rise, share = high[1] - low[1], (waist[1] - low[1]) / (high[1] - low[1])
     if fit == 0.0 or not 0.25 < share < 0.75:
         return ()
@@ -290,7 +292,8 @@ def _cap_size(front: float, back: float, width: float) -> tuple[float, float, fl
     def more(height: float) -> float:
         return across(front, height) + across(back, height) - width
 
-    low, high = 0.15 * min(front, back), 0.85 * min(front, back)
+    # A higher cap hangs better and lifts the whole sleeve with a raised arm.
+    low, high = 0.15 * min(front, back), 0.42 * min(front, back)
     height = low if more(low) <= 0.0 else high if more(high) >= 0.0 else float(brentq(more, low, high, xtol=1e-4))
     return height, across(front, height), across(back, height)
 
@@ -301,7 +304,7 @@ def sleeves(
     """Sleeves of two panels each, sewn into the armholes of front and back; cuffs of that height [m] at their ends."""
     armholes = t.lengths([("front", "left_armhole"), ("back", "left_armhole")])
     height, *halves = _cap_size(puff * armholes[0], puff * armholes[1], m.upper_arm * (1.15 + ease) * (0.5 + 0.5 * puff))
-    length = max(length * m.arm_length - cuff, height + 0.04)
+    length = max(length * (m.arm_length + _RAISED) - cuff, height + 0.04)
     # Along the arm the sleeve grows narrower as the arm does, to the hem that the option widens or narrows.
     arm = m.upper_arm + (m.wrist - m.upper_arm) * min(length / m.arm_length, 1.0)
     end = max(wide * sum(halves) * (0.35 + 0.65 * arm / m.upper_arm), arm * 1.1)
@@ -327,7 +330,7 @@ def sleeves(
         t.draw(f"left_sleeve_{name}", outline, angles, at, "arm")
         t.mirror(f"left_sleeve_{name}", f"right_sleeve_{name}")
         if cuff:
-            band = 0.5 * m.wrist * 1.25
+            band = 0.5 * arm * 1.25
             sides = [Side("rim", (0.0, -length - cuff)), Side("under", (band, -length - cuff)), Side("upper", (band, -length))]
             sides.append(Side("over", (0.0, -length)))
             t.draw(f"left_cuff_{name}", sides if back else mirrored(sides), angles, at, "arm")

@@ -141,10 +141,11 @@ def _design(**options: Range) -> Callable[[Callable[[Table, Measures, Options], 
     return enter
 
 
-def _gores(t: Table, ring: float, circle: float, length: float, top: Point, tilt: float) -> None:
+def _gores(t: Table, ring: float, circle: float, length: float, top: Point, least: float = 0.0) -> None:
     """Four sectors of a share of a circle, sewn to a ring around an edge of length ``ring`` [m] at ``top``, its y and z; each
-    has two pieces there. They begin tilted outwards by ``tilt`` [degrees]."""
-    half, inner = 0.25 * math.pi * circle, ring / (2.0 * math.pi * circle)
+    has two pieces there. They begin as a pyramid, tilted outwards by ``least`` [degrees] at least."""
+    half, inner, off = 0.25 * math.pi * circle, ring / (2.0 * math.pi * circle), ring / (2.0 * math.pi) + 0.02
+    tilt = math.degrees(math.asin(min(max(((inner + length) * math.sin(half) + 0.01 - off) / length, 0.0), 0.9)))
 
     def arc(radius: float, first: float, last: float) -> tuple[Point, tuple[Point, Point]]:
         """Start and control points of an arc below the centre, between two angles from straight down."""
@@ -166,10 +167,10 @@ def _gores(t: Table, ring: float, circle: float, length: float, top: Point, tilt
     ]
     names = ["gore_back_right", "gore_front_right", "gore_front_left", "gore_back_left"]
     for name, around in zip(names, (-135.0, -45.0, 45.0, 135.0), strict=True):
-        angles = (-tilt, around, 0.0)
+        angles = (-max(tilt, least), around, 0.0)
         out = np.array([math.sin(math.radians(around)), 0.0, math.cos(math.radians(around))])
         waist = Rotation.from_euler("xyz", angles, degrees=True).apply([0.0, -inner, 0.0])
-        at = (ring / (2.0 * math.pi) + 0.02) * out + [0.0, *top] - waist
+        at = off * out + [0.0, *top] - waist
         t.draw(name, outline, angles, (float(at[0]), float(at[1]), float(at[2])))
     for name, other in zip(names, names[1:] + names[:1], strict=True):
         t.sew((name, "ahead"), (other, "behind"))
@@ -334,7 +335,7 @@ def _dress(t: Table, m: Measures, o: Options) -> None:
 def _swing(t: Table, m: Measures, o: Options) -> None:
     ring = 4.0 * sum(bodice(t, m, o.ease, _neck(o)))
     _sleeved(t, m, o, o.puff)
-    _gores(t, ring, o.circle, o.length * m.waist_height, (m.waist_height, 0.5 * (m.front + m.back)), 35.0 * o.circle)
+    _gores(t, ring, o.circle, o.length * m.waist_height, (m.waist_height, 0.5 * (m.front + m.back)))
     for back, name in enumerate(("front", "back")):
         t.sew_all(t.keys(name, "hem"), _gore_waist(t, bool(back)))
 
@@ -372,7 +373,7 @@ def _pencil(t: Table, m: Measures, o: Options) -> None:
 @_design(length=(0.5, 0.2, 0.95), circle=(1.0, 0.3, 1.2), band=(0.035, 0.03, 0.08))
 def _circle(t: Table, m: Measures, o: Options) -> None:
     middle = 0.5 * (m.front + m.back)
-    _gores(t, 1.02 * m.waist, o.circle, o.length * m.waist_height, (m.waist_height, middle), 35.0 * o.circle)
+    _gores(t, 1.02 * m.waist, o.circle, o.length * m.waist_height, (m.waist_height, middle))
     band(t, m, {back: _gore_waist(t, back) for back in (False, True)}, o.band, m.waist_height + o.band)
 
 
