@@ -186,7 +186,7 @@ def tiers(
 
 
 class Neck(NamedTuple):
-    """A neckline and the shoulders: see :data:`hood.assets.pattern.designs.MEANINGS`."""
+    """A neckline and the shoulders: see designs.MEANINGS."""
 
     depth: float
     width: float = 0.0
@@ -195,15 +195,14 @@ class Neck(NamedTuple):
 
 
 def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: Point | None = None) -> tuple[list[Side], Point]:
-    """Half of a bodice from the underarm to the middle of the neckline: armhole, shoulder, neckline; and where that ends. The
-    armhole begins across the side seam, which comes from ``below``."""
+    """Armhole, shoulder and neckline of half a bodice, and where that ends; the side seam comes from ``below``."""
     over = m.back_length if back else float(np.clip(m.front_length, m.back_length - 0.01, m.back_length + 0.025))
     top, slope = m.waist_height + over, max(m.neck_height - m.shoulder_height, 0.01)
     inner, outer = np.array([m.neck_width, top]), np.array([0.5 * m.shoulder_width, top - slope])
     side, tip = inner + neck.width * (outer - inner), inner + neck.strap * (outer - inner)
     armpit = (0.25 * m.chest * (1.0 + ease), m.underarm_height - 0.02 - 0.1 * ease)
     across = min(tip[0], armpit[0]) - 0.02 * neck.strap
-    lean = 0.0 if below is None else (armpit[0] - below[0]) / (armpit[1] - below[1])
+    lean = 0.0 if below is None else min((armpit[0] - below[0]) / (armpit[1] - below[1]), 0.5)
     armhole = ((across, armpit[1] + lean * (armpit[0] - across)), (across, 0.5 * (armpit[1] + tip[1])))
     depth = 0.02 + 0.05 * neck.width if back else neck.depth * over
     low = (0.0, float(min(top - depth, side[1] - 0.01)))
@@ -374,8 +373,7 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
 
 
 class Leg(NamedTuple):
-    """Of trousers, see :data:`hood.assets.pattern.designs.MEANINGS`; ``top`` is the height [m] of their waist, which each
-    quarter has in two ``pieces`` [m]."""
+    """Of trousers, see designs.MEANINGS; each quarter of their waist, at height ``top`` [m], has two ``pieces`` [m]."""
 
     ease: float
     knee: float

@@ -43,7 +43,7 @@ def corners(name: str) -> list[dict[str, Any]]:
             key: str(rng.choice(own)) if isinstance(own[0], str) else float(rng.uniform(own[1], own[2]))
             for key, own in known.items()
         }
-        for _ in range(3)
+        for _ in range(2)
     ]
     return [{}, low, high, *some]
 
@@ -60,7 +60,7 @@ def ends(pattern: Pattern) -> list[tuple[str, str, float, float]]:
 @pytest.mark.parametrize("name", DESIGNS)
 def test_seams_fit_over_the_ranges_of_the_options(name: str, bodies: list[Measures]) -> None:
     for number, options in enumerate(corners(name)):
-        for measures in bodies if number < 3 else bodies[:1]:
+        for measures in bodies if number == 0 else bodies[:1]:
             pattern = draft(name, measures, options)
             check_pattern(name, pattern)
             for first, second, own, other in ends(pattern):
@@ -75,7 +75,7 @@ def test_seams_fit_over_the_ranges_of_the_options(name: str, bodies: list[Measur
 def test_panels_weld_to_an_oriented_sheet(name: str, bodies: list[Measures]) -> None:
     for options in corners(name)[:3]:
         pattern = draft(name, bodies[0], options)
-        sheet = sheet_of(pattern, 0.03, name)
+        sheet = sheet_of(pattern, 0.035, name)
         half = sheet.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         assert len(np.unique(half, axis=0)) == len(half)  # every edge is passed once each way
         assert len(topology.boundary_loops(sheet.faces)) == OPENINGS[name]
@@ -125,19 +125,20 @@ def test_a_cap_is_as_long_as_its_armhole_and_a_little(bodies: list[Measures]) ->
                 assert own / other == pytest.approx(1.01, abs=2e-3)
 
 
-def test_options_act(bodies: list[Measures]) -> None:
-    """Every option of every design changes the pattern."""
-    for name, design in DESIGNS.items():
-        for key, known in design.options.items():
-            base = {"sleeve": 0.4} if key in ("wide", "puff") else {}
-            value = next(value for value in reversed(known) if value != known[0])
-            plain, other = (draft(name, bodies[0], base | change) for change in ({}, {key: value}))
-            lengths = [
-                [(panel.name, round(edge.length, 6)) for panel in one.panels.values() for edge in panel.edges]
-                for one in (plain, other)
-            ]
-            assert lengths[0] != lengths[1], (name, key)
-            assert key in MEANINGS
+def lengths(name: str, measures: Measures, options: dict[str, Any]) -> list[float]:
+    panels = draft(name, measures, options).panels.values()
+    return [round(edge.length, 6) for panel in panels for edge in panel.edges]
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_every_option_changes_the_pattern(name: str, bodies: list[Measures]) -> None:
+    options = DESIGNS[name].options
+    base = {"sleeve": 0.4} if "puff" in options or name == "shift" else {}
+    plain = lengths(name, bodies[0], base)
+    for key, known in options.items():
+        value = next(value for value in reversed(known) if value != base.get(key, known[0]))
+        assert lengths(name, bodies[0], base | {key: value}) != plain, key
+        assert key in MEANINGS
 
 
 @pytest.mark.parametrize(
