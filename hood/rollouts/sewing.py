@@ -22,7 +22,7 @@ from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.sheet import PatternSheet, carried, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput
-from hood.energies.potential import Potential, default_potential
+from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
@@ -60,8 +60,8 @@ _ROUGH, _FINE = NewtonSettings(target_rg=0.1, max_iterations=15), NewtonSettings
 _PAUSE = 8
 #: The coarse mesh has about so many vertices, with edges from the second to the third [m].
 _COARSE, _LEAST_EDGE, _MOST_EDGE = 700, 0.022, 0.05
-#: Patterns are drawn for a body of this height [m], and one whose top is lower than the second there is held up by its waist.
-_HEIGHT, _WAIST = 1.72, 1.24
+#: A garment whose top is below this share of the height of the body that it was drawn for is held up by its waist.
+_WAIST = 0.72
 #: Arms of the poses of the T and the A, degrees below the former.
 _TPOSE, _APOSE = 0.0, 45.0
 #: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
@@ -114,7 +114,7 @@ def sew(
     tries = []
     for way in ways:
         rough = sewn = sew_around(coarse, way.posed, material, start=way)
-        if coarse is not sheet and not rough.figures.faults:
+        if coarse is not sheet and rough.figures.in_place:
             sewn = refined(coarse, rough, sheet, way, material)
         tries.append((way, rough, sewn))
         if not sewn.figures.faults:
@@ -155,7 +155,7 @@ def starts(sheet: PatternSheet, posed: PosedBody) -> list[Start]:
     surface = posed.surface
     thin = _bones(posed)
     thin += _THIN * (surface - thin)
-    higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / _HEIGHT - 1.0)
+    higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
     found = []
     for depth in _DEPTHS:
         for lift in _LIFTS:
@@ -198,7 +198,7 @@ def waist_of(sheet: PatternSheet) -> np.ndarray:
     """(V,) bool: the upper rim of a garment for the lower body: edges that the pattern calls ``lower_interface``, else the
     highest opening where all of the pattern is below the chest. None of other garments."""
     held = np.zeros(len(sheet.pos), dtype=bool)
-    if sheet.pos[:, 1].max() > _WAIST:
+    if sheet.pos[:, 1].max() > _WAIST * sheet.height:
         return held
     rims = boundary_loops(sheet.faces)
     rim = np.zeros_like(held)
@@ -314,18 +314,18 @@ class _Work:
     def rest(self, pos: Tensor, dt: float) -> tuple[Tensor, int, float]:
         """The cloth at rest under its weight, the steps, and the speed [m/s] in the last; the first lasts ``dt`` [s]."""
         plain, body, speed = default_potential(contact="strict"), self.body(1.0, 1.0), math.inf
-        potential = plain
+        potential, settings = plain, _ROUGH
         for count in range(1, _MOST_RESTING + 1):
             if potential is plain:
                 pos = self._smoothed(pos) if count % _PAUSE == 1 else pos
                 if not self._crosses(pos):
                     potential = plain.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(0.3))
             longest = dt >= _LONGEST
-            settings = _FINE if longest else _ROUGH
+            settings = _FINE if longest else settings
             now = minimize(potential, self._problem(pos, dt, body, True), pos, settings)[0]
             moved = (now - pos).norm(dim=1)
             if not math.isfinite(float(moved.max())) or (float(moved.max()) > 3.0 * _STRIDE and dt > 1.0 / 240.0):
-                dt *= 0.5
+                dt *= 0.25  # where a fold turns over, rough steps would stand still
                 continue
             pos, speed = now, float(moved.mean()) / dt
             self.progress.tell(f"it comes to rest, step {count}, and moves by {1e3 * speed:.1f} mm a second")

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: A garment that is sewn well: strain p99, and what its top has sunk or risen by [m], are no more.
 STRAIN, SUNK = 0.25, 0.15
+#: A coarse mesh is stretched by less than this where a fine one can come to rest.
+_COARSE_STRAIN = 0.6
 #: In the last step the vertices move by no more than this [m/s] in the mean.
 STILL = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
@@ -73,6 +75,12 @@ class SewnFigures:
             (not self.speed <= STILL, f"it still moves by {1e3 * self.speed:.1f} mm a second"),
         )
         return [text for bad, text in limits if bad]
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it is where it is worn; what else is wrong with a coarse mesh may be right with a fine one."""
+        worn = not self.empty_openings and not self.swapped and abs(self.sunk) <= SUNK
+        return worn and self.strain_p99 <= _COARSE_STRAIN
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -159,7 +167,7 @@ def _limb(joint: int) -> str | None:
 
 
 def _passes(start: np.ndarray, end: np.ndarray, middle: np.ndarray, rim: np.ndarray, after: np.ndarray) -> bool:
-    """Whether a bone (3,) to (3,) meets one of the triangles between the middle of a rim and its edges, an odd number of times."""
+    """Whether a bone (3,) to (3,) meets the triangles between the middle of a rim and its edges an odd number of times."""
     way, first, second = end - start, rim - middle, after - middle
     normal = np.cross(way, second)
     det = (first * normal).sum(axis=1)

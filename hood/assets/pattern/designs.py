@@ -105,7 +105,7 @@ def draft(name: str, measures: Measures, options: Mapping[str, Any] | None = Non
         chosen[key] = _checked(name, key, value)
     table = Table()
     design.draw(table, measures, Options(**chosen))
-    pattern = Pattern(name, table.panels, tuple(table.stitches))
+    pattern = Pattern(name, table.panels, tuple(table.stitches), measures.height)
     check_pattern(f"design:{name}", pattern, MOST_GATHERED)
     return pattern
 

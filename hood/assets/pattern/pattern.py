@@ -21,6 +21,8 @@ from hood.assets.files.guarded import check_size
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
 MOST_GATHERED = 4.0
+#: Height [m] of the body that patterns are placed around that do not say.
+BODY_HEIGHT = 1.72
 #: Points of a curve that measure its length and find where outlines cross.
 _POINTS = 33
 #: Edges shorter than this [m] are none. A pattern has units of at most so many metres.
@@ -117,11 +119,12 @@ class Stitch:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Panels by name and their stitches."""
+    """Panels by name and their stitches; ``height`` [m] is that of the body around which they are placed."""
 
     name: str
     panels: Mapping[str, PatternPanel]
     stitches: tuple[Stitch, ...]
+    height: float = BODY_HEIGHT
 
 
 def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
@@ -150,8 +153,8 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     table = content.get("pattern") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("panels"), dict) and table["panels"]):
         raise ValueError(f"{path}: no pattern.panels; give a GarmentCode specification.json")
-    properties = content.get("properties")
-    units = properties.get("units_in_meter", 100) if isinstance(properties, dict) else 100
+    properties = content.get("properties") if isinstance(content.get("properties"), dict) else {}
+    units = properties.get("units_in_meter", 100)
     if isinstance(units, bool) or not isinstance(units, (int, float)) or not 0.1 <= units <= 1e4:
         raise ValueError(f"{path}: properties.units_in_meter is {units!r}; write 100 for centimetres")
     panels = {name: _panel(f"{path}: panel {name!r}", name, own, 1.0 / units) for name, own in table["panels"].items()}
@@ -159,7 +162,10 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     if not isinstance(stitches, list):
         raise ValueError(f"{path}: pattern.stitches is no list; write [[{{panel, edge}}, {{panel, edge}}], …]")
     found = tuple(_stitch(f"{path}: stitch {number}", own, panels) for number, own in enumerate(stitches))
-    pattern = Pattern(path.parent.name if path.stem == "specification" else path.stem, panels, found)
+    height = float(_numbers(f"{path}: properties.body_height", properties.get("body_height", BODY_HEIGHT * units), ())) / units
+    if not 0.3 <= height <= 3.0:
+        raise ValueError(f"{path}: properties.body_height is {height:g} m; give the height of the body, in the file's unit")
+    pattern = Pattern(path.parent.name if path.stem == "specification" else path.stem, panels, found, height)
     _check_stitches(str(path), pattern, most_gathered)
     return pattern
 
@@ -337,6 +343,7 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
         sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
         stitches.append([*sides, "right_wrong"] if stitch.same else sides)
     properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
+    properties["body_height"] = round(100.0 * pattern.height, 10)
     content = {
         "pattern": {"panels": panels, "stitches": stitches, "panel_order": list(panels)},
         "parameters": {},

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.pattern import Pattern, PatternPanel
+from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
 
 #: Points inside a panel keep this share of the edge length from its outline.
@@ -33,6 +33,7 @@ class PatternSheet:
             length; NaN inside.
         seam: (V,) bool, vertices of a stitch.
         edge_labels: (V,) bool by label of an edge, the vertices along it.
+        height: m, of the body around which the panels are placed.
     """
 
     pos: np.ndarray
@@ -43,6 +44,7 @@ class PatternSheet:
     outline: np.ndarray
     seam: np.ndarray
     edge_labels: Mapping[str, np.ndarray]
+    height: float = BODY_HEIGHT
 
     @property
     def flat(self) -> np.ndarray:
@@ -108,7 +110,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
     own = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(middle, welded, np.concatenate(tables), corners, own, np.concatenate(places), seam, marks)
+    return PatternSheet(middle, welded, np.concatenate(tables), corners, own, np.concatenate(places), seam, marks, pattern.height)
 
 
 def carried(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
