@@ -45,9 +45,7 @@ def run(arguments: Sequence[str]) -> int:
     words, config = split_words("sew", arguments)
     if len(words) != 1:
         given = f"{len(words)} files are given" if words else "no file is given"
-        raise ConfigError(
-            f"{given}: write one, hood sew specification.json output=shirt.npz, or a design, hood sew design:tshirt"
-        )
+        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz, or hood sew design:tshirt")
     word, edge = words[0], _number(config, "edge", _FINEST, _COARSEST)
     gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
     if angle is None and str(config.pose) != AUTO:
@@ -92,10 +90,9 @@ def _pattern(word: str, config: DictConfig, gathers: float) -> tuple[Pattern, Bo
         raise ConfigError(f"design={shown(config.design)}: give options in braces, hood sew design:tshirt 'design={example}'")
     if name != word and name not in DESIGNS:
         raise ConfigError(unknown("design", name, DESIGNS))
-    betas = shape_coefficients(config.betas)
+    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
     if name == word:
-        return read_pattern(Path(word).expanduser(), gathers), load_body(str(config.body)), betas
-    body = load_body(str(config.body))
+        return read_pattern(Path(word).expanduser(), gathers), body, betas
     vertices, joints = body.shaped(betas)
     return draft(name, measure_body(vertices, body.faces, joints), chosen), body, betas
 

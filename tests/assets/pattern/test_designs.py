@@ -92,6 +92,7 @@ def test_a_written_design_is_read_back(name: str, bodies: list[Measures], tmp_pa
     again = read_pattern(path)
     assert again.name == name
     assert again.stitches == pattern.stitches
+    assert again.height == pytest.approx(bodies[1].height, abs=1e-9)
     assert list(again.panels) == list(pattern.panels)
     for key, panel in pattern.panels.items():
         other = again.panels[key]
