@@ -61,6 +61,7 @@ _EXAMPLES = {
     "sew": [
         "hood sew specification.json output=shirt.npz",
         "hood sew skirt.json body=default betas=[1.5] edge=0.012 output=skirt.npz",
+        "hood sew design:tshirt design={length:0.3,sleeve:0.5} betas=[1.5] pattern=tshirt.json output=tshirt.npz",
     ],
     "fabric": [
         "hood fabric",
@@ -103,7 +104,11 @@ _EXAMPLES = {
     ],
 }
 #: Words of a command that are no keys.
-_BEFORE_KEYS = {**dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "), "fabric": "[NAME ...] ", "sew": "FILE "}
+_BEFORE_KEYS = {
+    **dict.fromkeys(("inspect", "compare", "view", "export"), "FILE ... "),
+    "fabric": "[NAME ...] ",
+    "sew": "FILE|design:NAME ",
+}
 
 
 #: Keys that take an embedded name of a kind, or a file; a command has one of each, or none.

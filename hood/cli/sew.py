@@ -1,4 +1,4 @@
-"""``hood sew FILE``: a sewing pattern in, the garment that it makes on a body out, judged before it is written."""
+"""``hood sew FILE`` or ``hood sew design:NAME``: a sewing pattern in; out the garment that it makes on a body, judged."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from hood.app.common import prepare_folder, require_package, split_words
 from hood.app.scene.fabrics import fabric_named
 from hood.app.scene.garments import shape_coefficients
 from hood.app.scene.placing import AUTO, arm_angle
-from hood.app.settings.compose import ConfigError, options, shown
+from hood.app.settings.compose import ConfigError, options, plain, shown
+from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.library import unknown
-from hood.assets.garment.binding import PosedBody, bind_posed, posed_body
+from hood.assets.garment.binding import PosedBody, bind_posed
 from hood.assets.garment.garment import Garment, save_garment
 from hood.assets.material import Material, values_of
-from hood.assets.motion.sequence_edit import arms_down
+from hood.assets.pattern.designs import DESIGNS, draft
 from hood.assets.pattern.making import ELASTIC, with_elastic
-from hood.assets.pattern.pattern import Pattern, read_pattern
+from hood.assets.pattern.measures import measure_body
+from hood.assets.pattern.pattern import Pattern, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.media.exports.sequences import write_obj
 from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.sewing import Sewn, sew_around, waist_of
+from hood.rollouts.sewing import sew, waist_of
+from hood.rollouts.sewn import Sewn
 
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
-#: Of ``waist``; and how wide [m] and how stiff its elastic is, in shear [N/m]: it stretches by 10% under 1.5 N for each 3 cm.
-HELD, _WAISTBAND, _SHEAR = "held", 0.03, 169.0
-#: Arms of the poses of the T and the A, degrees below the former.
-_TPOSE, _APOSE = 0.0, 45.0
-#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
-_BESIDE, _HIGH = 0.19, 0.9
+#: Of ``waist``; what auto takes, how wide [m] its elastic is and how stiff in shear [N/m]: 3 cm stretch by 10% under 1.5 N.
+HELD, _DRAWN, _WAISTBAND, _SHEAR = "held", 0.85, 0.03, 169.0
+#: How the word of an own design begins.
+_DESIGN = "design:"
 _WIDTH, _HEIGHT = 420, 560
 #: Between panels in the picture [m], and pixels for its title.
 _MARGIN, _TITLE = 0.02, 36
@@ -48,30 +49,24 @@ def run(arguments: Sequence[str]) -> int:
     words, config = split_words("sew", arguments)
     if len(words) != 1:
         given = f"{len(words)} files are given" if words else "no file is given"
-        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz")
-    path, edge = Path(words[0]).expanduser(), _number(config, "edge", _FINEST, _COARSEST)
+        raise ConfigError(f"{given}: write one, hood sew specification.json output=shirt.npz, or hood sew design:tshirt")
+    word, edge = words[0], _number(config, "edge", _FINEST, _COARSEST)
     gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
     if angle is None and str(config.pose) != AUTO:
         raise ConfigError(f"pose={shown(config.pose)}: give tpose, apose, degrees of the arms below the T-pose, or auto")
     if str(config.material) not in options("material"):
         raise ConfigError(unknown("fabric", str(config.material), options("material")))
     material = fabric_named(str(config.material))
-    pattern = read_pattern(path, gathers)
+    pattern, body, betas = _pattern(word, config, gathers)
     target = _target(config, pattern)
-    picture = _picture(config, target)
-    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
-    waist = None if config.waist == HELD else _number(config, "waist", *ELASTIC, f", or {HELD}")
-    sheet = sheet_of(pattern, edge, str(path))
-    rim = waist_of(sheet, float(np.ptp(body.shaped(betas)[0][:, 1])))
-    if waist is not None and rim.any() and not (rim & sheet.gathered).any():
-        stiffness = _SHEAR / float(np.mean(values_of(material.lame_mu)[0]) * np.mean(values_of(material.thickness)[0]))
-        sheet = with_elastic(sheet, rim, waist, _WAISTBAND, max(stiffness, 1.0))
+    picture, written, factor = _picture(config, target), _specification(config), _waist(config)
+    sheet = _with_waist(sheet_of(pattern, edge, word), factor, material)
     prepare_folder(target.parent)
-    angles = [angle] if angle is not None else ([_APOSE, _TPOSE] if _sleeved(pattern) else [_TPOSE, _APOSE])
-    found = [_attempt(sheet, posed_body(body, arms_down(angles[0]), 0, betas), material)]
-    if found[0][1].figures.faults and len(angles) > 1:
-        found.append(_attempt(sheet, posed_body(body, arms_down(angles[1]), 0, betas), material))
-    posed, sewn = min(found, key=lambda one: len(one[1].figures.faults))
+    if written is not None:
+        prepare_folder(written.parent)
+        write_pattern(written, pattern)
+        print(f"written: {written}")
+    posed, sewn = sew(pattern, sheet, body, betas, material, angle)
     worn = _garment(pattern, sheet, sewn)
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:
@@ -91,11 +86,52 @@ def run(arguments: Sequence[str]) -> int:
     return 0
 
 
+def _pattern(word: str, config: DictConfig, gathers: float) -> tuple[Pattern, Body, np.ndarray]:
+    """The pattern of a file, or a design made to the measures of the body; that body, and its shape coefficients."""
+    chosen, name = plain(config.design), word.removeprefix(_DESIGN)
+    if chosen is not None and (name == word or not isinstance(chosen, dict)):
+        example = "{length:0.3,ease:0.1}"
+        raise ConfigError(f"design={shown(config.design)}: give options in braces, hood sew design:tshirt 'design={example}'")
+    if name != word and name not in DESIGNS:
+        raise ConfigError(unknown("design", name, DESIGNS))
+    body, betas = load_body(str(config.body)), shape_coefficients(config.betas)
+    if name == word:
+        return read_pattern(Path(word).expanduser(), gathers), body, betas
+    vertices, joints = body.shaped(betas)
+    return draft(name, measure_body(vertices, body.faces, joints), chosen), body, betas
+
+
+def _specification(config: DictConfig) -> Path | None:
+    """Where the pattern itself is written; None: nowhere."""
+    if config.pattern is None:
+        return None
+    path = Path(str(config.pattern)).expanduser()
+    if path.suffix != ".json":
+        raise ConfigError(f"pattern={path}: patterns are .json files")
+    return path
+
+
 def _number(config: DictConfig, key: str, low: float, high: float, other: str = "") -> float:
     value = config[key]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise ConfigError(f"{key}={shown(value)}: give a number from {low:g} to {high:g}{other}")
     return float(value)
+
+
+def _waist(config: DictConfig) -> float | None:
+    """How many times as long as it is cut the elastic of a waist is at rest; None: it is held."""
+    if str(config.waist) in (AUTO, HELD):
+        return _DRAWN if str(config.waist) == AUTO else None
+    return _number(config, "waist", *ELASTIC, f", {AUTO} or {HELD}")
+
+
+def _with_waist(sheet: PatternSheet, factor: float | None, material: Material) -> PatternSheet:
+    """The pattern with elastic along its waist, where it has one and no elastic there."""
+    rim = waist_of(sheet)
+    if factor is None or not rim.any() or (rim & sheet.gathered).any():
+        return sheet
+    shear = float(np.mean(values_of(material.lame_mu)[0]) * np.mean(values_of(material.thickness)[0]))
+    return with_elastic(sheet, rim, factor, _WAISTBAND, max(_SHEAR / shear, 1.0))
 
 
 def _target(config: DictConfig, pattern: Pattern) -> Path:
@@ -115,19 +151,6 @@ def _picture(config: DictConfig, target: Path) -> Path | None:
         raise ConfigError(f"sheet={word}: sheets are .png files; give one, auto or none")
     require_package("PIL", "Pillow", "pictures", "the sheet of hood sew (sheet=none draws none)")
     return picture
-
-
-def _sleeved(pattern: Pattern) -> bool:
-    """Whether a panel is one of a sleeve, by its label or its place."""
-    for panel in pattern.panels.values():
-        middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
-        if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
-            return True
-    return False
-
-
-def _attempt(sheet: PatternSheet, posed: PosedBody, material: Material) -> tuple[PosedBody, Sewn]:
-    return posed, sew_around(sheet, posed, material)
 
 
 def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:
@@ -156,6 +179,9 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
     ]
     if sewn.held.any():
         lines.append(f"its waist is held, {int(sewn.held.sum())} vertices; pins=none of hood rollout lets it go")
+    if sheet.made.elastic is not None:
+        count = int((sheet.made.elastic != 1.0).any(axis=1).sum())
+        lines.append(f"elastic in {count} triangles; waist=held holds a waist instead")
     return lines
 
 

@@ -133,7 +133,7 @@ def root_of(metric: np.ndarray) -> np.ndarray:
 
 
 #: What is known of sides, and what says nothing of one.
-SIDES = {"elastic": 1.0, "fold": float("nan"), "bending": 1.0}
+SIDE_TABLES = {"elastic": 1.0, "fold": float("nan"), "bending": 1.0}
 
 
 @dataclass(frozen=True)

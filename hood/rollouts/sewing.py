@@ -2,6 +2,7 @@
 
 The panels begin where the pattern puts them, in planes before and behind the body, and their seams between these: cloth would
 pass through the body there. So the body begins thin, nearly its bones, and grows to its size while the seams draw together.
+A coarse mesh is sewn first. The one that was asked for begins where that has come to rest.
 """
 
 from __future__ import annotations
@@ -16,133 +17,188 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.said import ProgressLines
-from hood.assets.fitting.suspicions import find_openings
-from hood.cloth.cloth import Cloth, build_cloth
+from hood.assets.garment.binding import posed_body
+from hood.assets.motion.sequence_edit import arms_down
+from hood.assets.pattern.sheet import PatternSheet, carried, sheet_of
+from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput
-from hood.energies.potential import Potential, default_potential
+from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
+from hood.rollouts.sewn import Sewn, joints_of, judged
+from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.retry import minimize_held_off
 
 if TYPE_CHECKING:
+    from hood.assets.body.body import Body
     from hood.assets.garment.binding import PosedBody
     from hood.assets.material import Material
-    from hood.assets.pattern.sheet import PatternSheet
+    from hood.assets.pattern.pattern import Pattern
 
 #: The thin body has this share of the way from its bones to its skin, and its skin grows by so much [m] a step at most.
-_THIN, _GROWTH = 0.15, 0.006
+_THIN, _GROWTH = 0.15, 0.012
+#: In another attempt they are so.
+_THINNER, _SLOWER = 0.05, 0.006
 #: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body.
 _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
 #: A step in which a vertex goes farther than twice this [m] is taken again with half the time; steps grow while none does.
 _STRIDE = 0.02
 #: Steps without weight last from the first to the second [s], those under it to the third; so many at most of each.
-_SHORTEST, _DRAWN, _LONGEST, _MOST_DRAWN, _MOST_RESTING = 1e-4, 0.1, 1.0, 160, 60
+_SHORTEST, _DRAWN, _LONGEST, _MOST_DRAWN, _MOST_RESTING = 1e-4, 0.1, 1.0, 120, 40
 #: Of the steps without weight, so many at most once the body has grown: what creeps then goes on under weight.
-_MOST_GROWN = 15
+_MOST_GROWN = 10
 #: The body grows once steps are so long [s]: before, the seams are open.
 _CLOSED = 2e-3
 #: At rest the vertices move by less than this [m/s] in the mean, without weight by less than the second.
 _REST, _NEARLY = 1e-3, 5e-3
 _ROUGH, _FINE = NewtonSettings(target_rg=0.1, max_iterations=15), NewtonSettings(target_rg=1e-2)
-#: A garment that is sewn well: strain p99 and what its top has sunk by [m] are no more.
-STRAIN, SUNK = 0.25, 0.15
-#: A garment whose top is below this share of the body's height is held up by its waist.
+#: Cloth at rest that passes through itself is smoothed there once in so many steps.
+_PAUSE = 8
+#: The coarse mesh has about so many vertices, with edges from the second to the third [m].
+_COARSE, _LEAST_EDGE, _MOST_EDGE = 700, 0.022, 0.05
+#: A garment whose top is below this share of the height of the body that it was drawn for is held up by its waist.
 _WAIST = 0.72
+#: Arms of the poses of the T and the A, degrees below the former.
+_TPOSE, _APOSE = 0.0, 45.0
+#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
+_BESIDE, _HIGH = 0.19, 0.9
+#: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
+_LOW, _PRESSED = 0.15, 0.06
+#: The floor reaches so far [m] from the middle, in squares of the second.
+_FLOOR, _SQUARE = 1.2, 0.1
 
 
 @dataclass(frozen=True)
-class SewnFigures:
-    """What a sewn garment is judged by.
+class Start:
+    """Where a pattern begins around a body: moved up and forward [m], with the share of the body's girth that it has then."""
 
-    Args:
-        body_crossings: triangles of cloth and skin that pass through each other, in pairs.
-        self_crossings: of cloth and cloth.
-        strain_p99: of the lengths of its edges in the pattern.
-        empty_openings: with no part of the body in them, of ``openings``.
-        sunk: m, of its highest point since it began.
-        speed: m/s, the mean in the last step.
-    """
-
-    body_crossings: int
-    self_crossings: int
-    strain_p99: float
-    openings: int
-    empty_openings: int
-    sunk: float
-    speed: float
-
-    @property
-    def faults(self) -> list[str]:
-        """What is wrong with it, in words; none where it is sewn well."""
-        limits = (
-            (self.body_crossings > 0, f"{self.body_crossings} pairs of triangles pass through the body"),
-            (self.self_crossings > 0, f"{self.self_crossings} pairs of its own triangles pass through each other"),
-            (not self.strain_p99 <= STRAIN, f"it is stretched by {self.strain_p99:.0%} (p99; {STRAIN:.0%} is allowed)"),
-            (self.empty_openings > 0, f"{self.empty_openings} of {self.openings} openings hold no part of the body"),
-            (self.sunk > SUNK, f"its top has sunk by {1e2 * self.sunk:.0f} cm"),
-            (not self.speed <= 2.0 * _REST, f"it still moves by {1e3 * self.speed:.1f} mm a second"),
-        )
-        return [text for bad, text in limits if bad]
-
-
-@dataclass(frozen=True)
-class Sewn:
-    """A garment where it hangs.
-
-    Args:
-        pos: (V, 3) m.
-        held: (V,) bool, vertices that were held.
-        lift: m up, and ``depth`` m forward, that it was moved by before it began.
-        steps: taken.
-        seconds: of computing.
-    """
-
-    pos: np.ndarray
-    held: np.ndarray
+    posed: PosedBody
     lift: float
     depth: float
-    figures: SewnFigures
-    steps: int
-    seconds: float
+    crossed: int  # triangles through the thin body
+    thin: float = _THIN
+    growth: float = _GROWTH
+
+    def placed(self, sheet: PatternSheet) -> np.ndarray:
+        """(V, 3) m: the vertices of a pattern; what reaches below the floor is pressed together above it."""
+        pos = sheet.pos + [0.0, self.lift, self.depth]
+        low = np.minimum(pos[:, 1], _PRESSED)
+        pos[:, 1] += _PRESSED * np.exp((low - _PRESSED) / _PRESSED) - low
+        return np.asarray(pos + [0.0, float(self.posed.surface[:, 1].min()), 0.0])
 
 
 @torch.no_grad()
-def sew_around(sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None) -> Sewn:
-    """The pattern sewn around a body that stands still.
+def sew(
+    pattern: Pattern, sheet: PatternSheet, body: Body, betas: np.ndarray, material: Material, angle: float | None = None
+) -> tuple[PosedBody, Sewn]:
+    """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and start.
+
+    Args:
+        angle: of the arms below the T-pose, degrees; None: 45 with sleeves and 0 without, and the other in an attempt.
+
+    Examples:
+        >>> sheet = sheet_of(pattern, 0.012, "shirt")  # doctest: +SKIP
+        >>> posed, sewn = sew(pattern, sheet, body, np.zeros(10), Material())  # doctest: +SKIP
+        >>> sewn.figures.faults  # doctest: +SKIP
+        []
+    """
+    began = time.perf_counter()
+    coarse = _coarser(pattern, sheet)
+    angles = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
+    begins = [starts(coarse, posed_body(body, arms_down(one), 0, betas)) for one in angles]
+    ways = [begin[0] for begin in begins] + [replace(begins[0][1], thin=_THINNER, growth=_SLOWER)]
+    tries = []
+    for way in ways:
+        rough = sewn = sew_around(coarse, way.posed, material, start=way)
+        if coarse is not sheet and rough.figures.in_place:
+            sewn = refined(coarse, rough, sheet, way, material)
+        tries.append((way, rough, sewn))
+        if not sewn.figures.faults:
+            break
+    way, rough, sewn = min(tries, key=lambda one: one[2].figures.rank)
+    if coarse is not sheet and sewn is rough:
+        sewn = refined(coarse, rough, sheet, way, material)
+    return way.posed, replace(sewn, seconds=time.perf_counter() - began)
+
+
+def _coarser(pattern: Pattern, sheet: PatternSheet) -> PatternSheet:
+    """A mesh of the pattern with less than half the vertices, where one can be had; else ``sheet`` itself."""
+    area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
+    wide = min(max(math.sqrt(area / _COARSE / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
+    while True:
+        try:
+            coarse = sheet_of(pattern, wide, pattern.name)
+        except ValueError:  # a panel is too narrow for such edges
+            coarse = None
+        if coarse is not None:
+            return coarse if 2 * len(coarse.pos) < len(sheet.pos) else sheet
+        if area / wide**2 > len(sheet.pos):
+            return sheet
+        wide *= 0.8
+
+
+def sleeved(pattern: Pattern) -> bool:
+    """Whether a panel is one of a sleeve, by its label or its place."""
+    for panel in pattern.panels.values():
+        middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
+        if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
+            return True
+    return False
+
+
+def starts(sheet: PatternSheet, posed: PosedBody) -> list[Start]:
+    """Places of the pattern before and behind a body, that with the fewest triangles through the thin one first."""
+    surface = posed.surface
+    thin = _bones(posed)
+    thin += _THIN * (surface - thin)
+    higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
+    found = []
+    for depth in _DEPTHS:
+        for lift in _LIFTS:
+            start = Start(posed, lift + higher, depth, 0)
+            crossed = len(crossings(start.placed(sheet), sheet.faces, thin, posed.faces).pairs)
+            found.append((crossed, abs(lift) + abs(depth), replace(start, crossed=crossed)))
+    return [start for _, _, start in sorted(found, key=lambda one: one[:2])]
+
+
+@torch.no_grad()
+def sew_around(
+    sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None, start: Start | None = None
+) -> Sewn:
+    """One mesh of a pattern sewn around a body that stands still, in one attempt.
 
     Args:
         sheet: its floor is at y = 0, its middle at x = z = 0.
         posed: the body.
         held: (V,) bool, vertices that are held while the cloth comes to rest; None: the waist of what is worn below it.
+        start: None: the best of :func:`starts`.
     """
-    began = time.perf_counter()
-    floor = float(posed.surface[:, 1].min())
-    bones = _bones(posed)
-    pos = sheet.pos + [0.0, floor, 0.0]
-    thin = bones + _THIN * (posed.surface - bones)
-    moves = [np.array([0.0, lift, depth]) for depth in _DEPTHS for lift in _LIFTS]
-    move = min(moves, key=lambda way: (len(crossings(pos + way, sheet.faces, thin, posed.faces).pairs), np.abs(way).sum()))
-    pos = pos + move
-    held = waist_of(sheet, float(np.ptp(posed.surface[:, 1]))) & ~sheet.gathered if held is None else held
-    firm = sheet.stiffness
-    cloth = build_cloth(pos, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=sheet.flat, made=sheet.made)
-    work = _Work(cloth, sheet.faces, posed, bones)
-    here, drawn = work.draw_together(torch.as_tensor(pos))
-    top = float(here[:, 1].max())
-    here, resting, speed = work.rest(here, torch.as_tensor(held))
-    figures = judged(cloth, sheet.faces, posed, here, top, speed)
-    return Sewn(here.numpy(), held, float(move[1]), float(move[2]), figures, drawn + resting, time.perf_counter() - began)
+    start = start or starts(sheet, posed)[0]
+    work = _Work(sheet, start, material, waist_of(sheet) & ~sheet.gathered if held is None else held)
+    here, drawn = work.draw_together(torch.as_tensor(work.begun), start)
+    here, resting, speed = work.rest(here, 1.0 / 60.0)
+    return work.sewn(here, drawn + resting, speed)
 
 
-def waist_of(sheet: PatternSheet, height: float) -> np.ndarray:
+@torch.no_grad()
+def refined(coarse: PatternSheet, sewn: Sewn, sheet: PatternSheet, start: Start, material: Material) -> Sewn:
+    """A garment that was sewn as the mesh ``coarse`` at rest as the mesh ``sheet`` of the same pattern."""
+    work = _Work(sheet, start, material, waist_of(sheet) & ~sheet.gathered)
+    pos = torch.as_tensor(carried(coarse, sewn.pos, sheet))
+    pos = push_out_of_body(work.cloth, pos, work.body(1.0, 1.0), 2e-3)
+    here, resting, speed = work.rest(pos, 1.0 / 30.0)
+    return work.sewn(here, sewn.steps + resting, speed)
+
+
+def waist_of(sheet: PatternSheet) -> np.ndarray:
     """(V,) bool: the upper rim of a garment for the lower body: edges that the pattern calls ``lower_interface``, else the
-    highest opening where all of the pattern is below the chest of a body of ``height`` [m]. None of other garments."""
+    highest opening where all of the pattern is below the chest. None of other garments."""
     held = np.zeros(len(sheet.pos), dtype=bool)
-    if sheet.pos[:, 1].max() > _WAIST * height:
+    if sheet.pos[:, 1].max() > _WAIST * sheet.height:
         return held
     rims = boundary_loops(sheet.faces)
     rim = np.zeros_like(held)
@@ -156,30 +212,9 @@ def waist_of(sheet: PatternSheet, height: float) -> np.ndarray:
     return held
 
 
-def judged(cloth: Cloth, faces: np.ndarray, posed: PosedBody, pos: Tensor, top: float, speed: float) -> SewnFigures:
-    """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began with its highest point at ``top`` [m]."""
-    at = pos.numpy()
-    if not np.isfinite(at).all():
-        return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
-    start, end = cloth.edges.unbind(dim=1)
-    strain = ((pos[end] - pos[start]).norm(dim=1) / cloth.rest_length - 1.0).abs().numpy()
-    openings = find_openings(at, faces, posed.surface, posed.faces)
-    return SewnFigures(
-        len(crossings(at, faces, posed.surface, posed.faces).pairs),
-        len(self_crossings(at, faces)),
-        float(np.quantile(strain, 0.99)),
-        openings.num,
-        openings.num_empty,
-        top - float(at[:, 1].max()),
-        speed,
-    )
-
-
 def _bones(posed: PosedBody) -> np.ndarray:
     """(W, 3) m: for every vertex of the skin the nearest points of the bones that it follows, in their mean by its weights."""
-    body, skin = posed.body, posed.surface
-    joints = body.shaped(posed.betas)[1]
-    joints = np.einsum("jab,jb->ja", posed.transforms[:, :, :3], joints) + posed.transforms[:, :, 3]
+    body, skin, joints = posed.body, posed.surface, joints_of(posed)
     result = np.zeros_like(skin)
     for joint in range(len(joints)):
         rows = np.flatnonzero(body.weights[:, joint] > 0)
@@ -196,42 +231,77 @@ def _bones(posed: PosedBody) -> np.ndarray:
     return result
 
 
+def _floor(height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) [m] and faces (F, 3) of a floor, its normals upwards."""
+    ticks = np.arange(-_FLOOR, _FLOOR + 0.5 * _SQUARE, _SQUARE)
+    x, z = (grid.reshape(-1) for grid in np.meshgrid(ticks, ticks, indexing="ij"))
+    number = np.arange(len(x)).reshape(len(ticks), -1)
+    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.stack([x, np.full_like(x, height), z], axis=1), faces
+
+
 class _Work:
     """The cloth of a pattern and the body that it is sewn around."""
 
-    def __init__(self, cloth: Cloth, faces: np.ndarray, posed: PosedBody, bones: np.ndarray) -> None:
-        self.cloth, self.faces = cloth, faces
-        self.skin, self.bones = torch.as_tensor(posed.surface), torch.as_tensor(bones)
-        self.body_faces = torch.as_tensor(posed.faces)
+    def __init__(self, sheet: PatternSheet, start: Start, material: Material, held: np.ndarray) -> None:
+        self.began = time.perf_counter()
+        self.start, self.faces, self.held = start, sheet.faces, held
+        self.begun = start.placed(sheet)
+        firm, flat = sheet.stiffness, sheet.flat
+        self.cloth = build_cloth(
+            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=flat, made=sheet.made
+        )
+        posed = start.posed
+        skin, bones, faces = posed.surface, _bones(posed), posed.faces
+        floor = float(skin[:, 1].min())
+        if float(sheet.pos[:, 1].min()) + start.lift < _LOW:
+            points, squares = _floor(floor)
+            faces = np.concatenate([faces, squares + len(skin)])
+            skin, bones = np.concatenate([skin, points]), np.concatenate([bones, points])
+        self.skin, self.bones, self.body_faces = (torch.as_tensor(table) for table in (skin, bones, faces))
         self.progress = ProgressLines("sewing")
-        far = float((self.skin - self.bones).norm(dim=1).max())
-        self._growth = _GROWTH / max(far, 1e-9)
+        self._growth = start.growth / max(float((self.skin - self.bones).norm(dim=1).max()), 1e-9)
 
-    def _body(self, share: float, later: float) -> Obstacle:
+    def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
+        """What has come of it."""
+        start, at = self.start, pos.numpy()
+        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed)
+        return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
+
+    def body(self, share: float, later: float) -> Obstacle:
         """The body that grows from one share of its way from the bones to another."""
         now, after = (self.bones + s * (self.skin - self.bones) for s in (share, later))
         scenes = [torch.zeros(len(table), dtype=torch.int64) for table in (now, self.body_faces)]
         return Obstacle(now, after, now, self.body_faces, *scenes)
 
-    def _step(
-        self, potential: Potential, pos: Tensor, dt: float, body: Obstacle, held: Tensor | None, settings: NewtonSettings
-    ) -> Tensor:
-        """One implicit step [s] from rest, with weight where something is held or meant to hang."""
-        return minimize(potential, self._problem(pos, dt, body, held), pos, settings)[0]
-
-    def _problem(self, pos: Tensor, dt: float, body: Obstacle, held: Tensor | None) -> StepProblem:
-        cloth = self.cloth if held is None else replace(self.cloth, pinned=held)
+    def _problem(self, pos: Tensor, dt: float, body: Obstacle, weight: bool) -> StepProblem:
+        """One implicit step [s] from rest, with weight and what is held, or without."""
+        cloth = replace(self.cloth, pinned=torch.as_tensor(self.held)) if weight else self.cloth
         step = StepInput(dt=pos.new_full((1,), dt), obstacle=body, pin_target=pos)
         problem = StepProblem(cloth, State(pos, torch.zeros_like(pos), pos.new_zeros(1, 3)), step)
-        return problem if held is not None else replace(problem, gravity=pos.new_zeros(3))
+        return problem if weight else replace(problem, gravity=pos.new_zeros(3))
 
-    def draw_together(self, pos: Tensor) -> tuple[Tensor, int]:
+    def _smoothed(self, pos: Tensor, share: float = 1.0) -> Tensor:
+        """The cloth smoothed where it passes through itself."""
+        return smooth_out(self.cloth, self.faces, pos, self.body(share, share), 2e-3)
+
+    def _crosses(self, pos: Tensor) -> bool:
+        return bool(len(self_crossings(pos.numpy(), self.faces)))
+
+    def draw_together(self, pos: Tensor, start: Start) -> tuple[Tensor, int]:
         """The seams closed without weight while the body grows; and the steps that it took."""
-        plain = default_potential(friction_coefficient=0.0, contact="strict")
-        potential, share, dt, grown = plain, _THIN, 1e-3, 0
+        plain = default_potential(friction_coefficient=0.0)
+        potential, share, dt, grown = plain, start.thin, 1e-3, 0
         for count in range(1, _MOST_DRAWN + 1):
-            later = min(1.0, share + self._growth) if dt > _CLOSED else share
-            now = self._step(potential, pos, dt, self._body(share, later), None, _ROUGH)
+            closed = dt > _CLOSED
+            later = min(1.0, share + self._growth) if closed else share
+            if closed and potential is plain:
+                if share == start.thin:
+                    pos = self._smoothed(pos, share)
+                if not self._crosses(pos):
+                    potential = plain.with_terms(layers=LayerBarrier())
+            now = minimize(potential, self._problem(pos, dt, self.body(share, later), False), pos, _ROUGH)[0]
             moved = (now - pos).norm(dim=1)
             if not math.isfinite(float(moved.max())) or (float(moved.max()) > 2.0 * _STRIDE and dt > 2.0 * _SHORTEST):
                 dt *= 0.5
@@ -241,28 +311,29 @@ class _Work:
             grown += share >= 1.0
             if grown >= _MOST_GROWN or (grown and dt >= _DRAWN and float(moved.mean()) / dt < _NEARLY):
                 break
-            if potential is plain and dt > _CLOSED and not len(self_crossings(pos.numpy(), self.faces)):
-                potential = plain.with_terms(layers=LayerBarrier())
             dt = min(max(dt * min(max(_STRIDE / max(float(moved.max()), 1e-9), 0.5), 2.0), _SHORTEST), _DRAWN)
-        pos = smooth_out(self.cloth, self.faces, pos, self._body(1.0, 1.0), 2e-3)
         return pos, count
 
-    def rest(self, pos: Tensor, held: Tensor) -> tuple[Tensor, int, float]:
-        """The cloth at rest under its weight, the steps, and the speed [m/s] in the last."""
-        potential, body, dt, speed = default_potential(contact="strict"), self._body(1.0, 1.0), 1.0 / 60.0, math.inf
-        if not len(self_crossings(pos.numpy(), self.faces)):
-            potential = potential.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(0.3))
+    def rest(self, pos: Tensor, dt: float) -> tuple[Tensor, int, float]:
+        """The cloth at rest under its weight, the steps, and the speed [m/s] in the last; the first lasts ``dt`` [s]."""
+        plain, body, speed = default_potential(contact="strict"), self.body(1.0, 1.0), math.inf
+        potential, settings = plain, _ROUGH
         for count in range(1, _MOST_RESTING + 1):
+            if potential is plain:
+                pos = self._smoothed(pos) if count % _PAUSE == 1 else pos
+                if not self._crosses(pos):
+                    potential = plain.with_terms(layers=LayerBarrier(), layer_friction=LayerFriction(0.3))
             longest = dt >= _LONGEST
-            now = self._step(potential, pos, dt, body, held, _FINE if longest else _ROUGH)
+            settings = _FINE if longest else settings
+            now = minimize(potential, self._problem(pos, dt, body, True), pos, settings)[0]
             moved = (now - pos).norm(dim=1)
             if not math.isfinite(float(moved.max())) or (float(moved.max()) > 3.0 * _STRIDE and dt > 1.0 / 240.0):
-                dt *= 0.5
+                dt *= 0.25  # where a fold turns over, rough steps would stand still
                 continue
             pos, speed = now, float(moved.mean()) / dt
             self.progress.tell(f"it comes to rest, step {count}, and moves by {1e3 * speed:.1f} mm a second")
             if longest and speed <= _REST:
                 break
             dt = min(max(dt * min(max(2.0 * _STRIDE / max(float(moved.max()), 1e-9), 0.5), 2.0), 1.0 / 240.0), _LONGEST)
-        problem = potential.prepare(self._problem(pos, _LONGEST, body, held))
+        problem = potential.prepare(self._problem(pos, _LONGEST, body, True))
         return minimize_held_off(potential, problem, pos, _FINE).pos, count, speed

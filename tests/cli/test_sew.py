@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from sewing_patterns import skirt, write
 
 import hood
 from hood.assets.garment.garment import load_garment
+from hood.assets.pattern.designs import DESIGNS
 from hood.cli.main import main
 from hood.mesh.flat import edge_lengths
 from hood.mesh.topology import unique_edges
@@ -23,18 +26,22 @@ def test_a_skirt_from_its_pattern_to_a_rollout(tmp_path: Path, capsys: pytest.Ca
     assert main(["sew", str(path), "edge=0.05", f"output={target}"]) == 0
     text = capsys.readouterr().out
     assert "2 panels, 2 stitches" in text
-    assert "pins=none" in text
+    assert "waist=held holds a waist instead" in text
     assert target.with_suffix(".png").stat().st_size > 10_000
     garment = load_garment(target)
     assert garment.flat is not None
+    assert not garment.pinned.any()
+    assert garment.elastic is not None
+    assert garment.elastic.min() == pytest.approx(0.85)
     assert set(garment.panels or {}) == {"front", "back"}
+    garment = replace(garment, elastic=None)
     scene = hood.build_scene(garment, hood.load_body(), hood.load_sequence("plie"))
     flat = torch.as_tensor(garment.flat[:, 1:] - garment.flat[:, :1])
     edges = torch.as_tensor(unique_edges(garment.faces))
     lengths = edge_lengths(flat, torch.as_tensor(garment.faces), edges)
     assert float((scene.cloth.rest_length.double() / lengths - 1.0).abs().max()) < 1e-3
-    frames = list(hood.simulate(garment, "plie", num_frames=4))
-    assert max(frame.metrics["strain_p99"] for frame in frames) < 0.1
+    frames = list(hood.simulate(load_garment(target), "plie", num_frames=4))
+    assert max(frame.metrics["strain_p99"] for frame in frames) < 0.25
 
 
 @pytest.mark.usefixtures("compiled_layers")
@@ -55,12 +62,20 @@ def test_what_is_not_sewn_well_is_kept_for_a_look(tmp_path: Path, capsys: pytest
         (["a.json", "b.json"], "2 files are given"),
         (["none.json"], "no such file"),
         (["skirt.json", "edge=9"], "edge=9: give a number from 0.004 to 0.1"),
+        (["skirt.json", "waist=pinned"], "waist=pinned: give a number from 0.2 to 2, auto or held"),
         (["skirt.json", "gathers=true"], "gathers=true: give a number"),
         (["skirt.json", "pose=run"], "pose=run: give tpose, apose"),
         (["skirt.json", "output=a.obj"], "output=a.obj: garments are .npz files"),
         (["skirt.json", "sheet=a.jpg"], "sheet=a.jpg: sheets are .png files"),
         (["skirt.json", "material=steel"], "steel"),
         (["broken.json"], "not JSON"),
+        (["design:tshrt"], "unknown design 'tshrt': did you mean 'tshirt'"),
+        (["design:"], "unknown design '': known are tank"),
+        (["design:skirt", "design={flair:0.5}"], "design:skirt: unknown option 'flair': did you mean 'flare (0 to 1.2)'"),
+        (["design:skirt", "design={flare:9}"], "design:skirt: flare is 9; give a number from 0 to 1.2"),
+        (["design:skirt", "design=wide"], "design=wide: give options in braces"),
+        (["skirt.json", "design={flare:0.5}"], "design={flare:0.5}: give options in braces, hood sew design:tshirt"),
+        (["design:skirt", "pattern=skirt.txt"], "pattern=skirt.txt: patterns are .json files"),
     ],
 )
 def test_mistakes_are_told_in_a_line(
@@ -84,3 +99,27 @@ def test_panels_stand_in_the_file(tmp_path: Path) -> None:
     assert scene.cloth.grain is not None
     warp = np.einsum("fi,fix->fx", scene.cloth.grain.double().numpy(), garment.flat[:, 1:] - garment.flat[:, :1])
     assert float(np.degrees(np.abs(np.arctan2(warp[:, 0], warp[:, 1]))).max()) < 1.0
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_a_design_is_sewn_and_its_pattern_can_be_sewn_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target, specification = tmp_path / "mini.npz", tmp_path / "patterns" / "mini.json"
+    words = ["edge=0.05", "sheet=none", "betas=[1.0]", f"output={target}"]
+    assert main(["sew", "design:skirt", "design={length:0.35,flare:0.2}", f"pattern={specification}", *words]) == 0
+    assert f"written: {specification}" in capsys.readouterr().out
+    first = load_garment(target)
+    assert main(["sew", str(specification), *words]) == 0
+    again = load_garment(target)
+    assert first.flat is not None
+    assert again.flat is not None
+    assert (len(again.rest_pos), len(again.faces)) == (len(first.rest_pos), len(first.faces))
+    areas = [np.abs(np.linalg.det(one.flat[:, 1:] - one.flat[:, :1])).sum() for one in (first, again)]
+    assert areas[1] == pytest.approx(areas[0], rel=1e-3)
+
+
+def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sew", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    listed = re.search(r"NAME one of ([\w, ]+);", text)
+    assert listed is not None
+    assert re.findall(r"\w+", listed[1].replace(" or ", ", ")) == list(DESIGNS)

@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from sewing_patterns import PATTERNS, skirt, write
 
-from hood.assets.body.body import Body
+from hood.assets.body.body import JOINTS, Body
 from hood.assets.garment.binding import posed_body
 from hood.assets.material import Material
 from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.pattern import read_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
-from hood.rollouts.sewing import Sewn, SewnFigures, sew_around, waist_of
+from hood.cloth.cloth import build_cloth
+from hood.rollouts.sewing import sew, sew_around, starts, waist_of
+from hood.rollouts.sewn import Sewn, SewnFigures, joints_of, judged, limbs_in
 
 
 def _sewn(name: str, tmp_path: Path, body: Body, edge: float) -> tuple[PatternSheet, Sewn]:
@@ -49,9 +52,9 @@ def test_a_waist_is_held_where_there_is_one(tmp_path: Path) -> None:
     for name, make in PATTERNS.items():
         path = write(tmp_path / f"{name}.json", make())
         sheet = sheet_of(read_pattern(path), 0.05, name)
-        held[name] = sheet.pos[waist_of(sheet, 1.72)][:, 1]
+        held[name] = sheet.pos[waist_of(sheet)][:, 1]
         unlabelled = replace(sheet, edge_labels={})
-        assert np.array_equal(waist_of(sheet, 1.72), waist_of(unlabelled, 1.72))
+        assert np.array_equal(waist_of(sheet), waist_of(unlabelled))
     assert len(held["tshirt"]) == len(held["bodice"]) == 0
     assert np.allclose(held["skirt"], 1.07)
     assert np.allclose(held["trousers"], 1.04)
@@ -68,6 +71,10 @@ def test_every_fault_is_told() -> None:
         ({"empty_openings": 1}, "1 of 4 openings hold no part"),
         ({"sunk": 0.4}, "its top has sunk by 40 cm"),
         ({"speed": 0.01}, "still moves by 10.0 mm a second"),
+        ({"sunk": -0.3}, "its top has risen by 30 cm"),
+        ({"loose": 0.06}, "its waist stands off the body by 6 cm"),
+        ({"under": 0.05}, "reaches 5 cm below the floor"),
+        ({"swapped": ("the left leg, not the trunk",)}, "an opening holds the left leg, not the trunk"),
     ):
         (text,) = replace(good, **change).faults
         assert words in text
@@ -78,3 +85,82 @@ def test_a_skirt_too_narrow_for_the_body_is_not_passed(tmp_path: Path, body: Bod
     path = write(tmp_path / "narrow.json", skirt(waist=50, hem=56))
     sheet = sheet_of(read_pattern(path), 0.05, str(path))
     assert sew_around(sheet, posed_body(body, arms_down(0.0), 0, np.zeros(10)), Material()).figures.faults
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_a_fine_mesh_begins_where_a_coarse_one_rests(tmp_path: Path, body: Body) -> None:
+    path = write(tmp_path / "skirt.json", PATTERNS["skirt"]())
+    pattern = read_pattern(path)
+    sheet = sheet_of(pattern, 0.016, str(path))
+    posed, sewn = sew(pattern, sheet, body, np.zeros(10), Material())
+    assert len(sewn.pos) == len(sheet.pos) > 2 * 700
+    assert sewn.figures.faults == []
+    assert np.ptp(posed.surface[:, 0]) > 1.4  # the arms are not in the way of a skirt
+
+
+@pytest.mark.usefixtures("compiled_layers")
+def test_a_long_hem_lies_on_the_floor(tmp_path: Path, body: Body) -> None:
+    path = write(tmp_path / "train.json", skirt(hem=150, length=115))
+    sheet = sheet_of(read_pattern(path), 0.06, str(path))
+    assert sheet.pos[:, 1].min() < -0.05
+    posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
+    sewn = sew_around(sheet, posed, Material())
+    floor = posed.surface[:, 1].min()
+    assert floor - 5e-3 < sewn.pos[:, 1].min() < floor + 0.02
+    assert sewn.figures.faults == []
+
+
+def test_a_pattern_moves_with_the_height_of_the_body(tmp_path: Path, body: Body) -> None:
+    path = write(tmp_path / "tshirt.json", PATTERNS["tshirt"]())
+    sheet = sheet_of(read_pattern(path), 0.05, str(path))
+    lifts = {}
+    for beta in (-2.0, 0.0, 2.0):
+        posed = posed_body(body, arms_down(45.0), 0, np.array([beta] + 9 * [0.0]))
+        lifts[float(np.ptp(posed.surface[:, 1]))] = starts(sheet, posed)[0].lift
+    assert [lift for _, lift in sorted(lifts.items())] == sorted(lifts.values())
+    assert len(set(lifts.values())) == 3
+
+
+def _ring(middle: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
+    axis = axis / np.linalg.norm(axis)
+    first = np.cross(axis, [0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.cross(axis, [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)[:, None]
+    return np.asarray(middle + radius * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)))
+
+
+def test_an_opening_is_told_by_the_limbs_in_it(body: Body) -> None:
+    posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
+    joint = dict(zip(JOINTS, joints_of(posed), strict=False))
+    up = np.array([0.0, 1.0, 0.0])
+
+    def within(a: str, b: str, axis: np.ndarray | None = None, radius: float = 0.1) -> set[str]:
+        middle = 0.55 * joint[a] + 0.45 * joint[b]
+        return set(limbs_in(_ring(middle, joint[b] - joint[a] if axis is None else axis, radius), posed))
+
+    assert within("neck", "head") == within("spine1", "spine2") == {"trunk"}
+    assert within("left_shoulder", "left_elbow") == {"left arm"}
+    assert within("right_knee", "right_ankle") == {"right leg"}
+    assert within("left_knee", "right_knee", up, 0.3) == {"trunk"}
+    assert within("left_shoulder", "head", up) == set()
+
+
+def test_openings_around_other_limbs_are_told(tmp_path: Path, body: Body) -> None:
+    posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
+    joint = dict(zip(JOINTS, joints_of(posed), strict=False))
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    quads = [[k, (k + 1) % 16, 16 + k] for k in range(16)] + [[(k + 1) % 16, 16 + (k + 1) % 16, 16 + k] for k in range(16)]
+    faces = np.array(quads)
+
+    def tube(x: float) -> np.ndarray:
+        ring = np.stack([0.12 * np.cos(angle), 0.0 * angle, 0.12 * np.sin(angle)], axis=1)
+        knee = joint["left_knee"] * [0.0, 1.0, 1.0] + [x, 0.0, 0.0]
+        return np.concatenate([ring + knee + [0.0, 0.1, 0.0], ring + knee - [0.0, 0.1, 0.0]])
+
+    left, right = tube(joint["left_knee"][0]), tube(joint["right_knee"][0])
+    cloth = build_cloth(left, faces, Material(), dtype=torch.float64)
+    none = np.zeros(len(left), dtype=bool)
+    assert judged(cloth, faces, posed, left, left, none, 0.0).swapped == ()
+    told = judged(cloth, faces, posed, left, right, none, 0.0)
+    assert told.swapped == ("the left leg, not the right leg",) * 2
+    assert told.faults == ["an opening holds the left leg, not the right leg; another the left leg, not the right leg"]

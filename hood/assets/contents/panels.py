@@ -13,7 +13,7 @@ from hood.assets.garment.garment import Garment
 from hood.assets.garment.record import SEAM, THREAD, Fitting, Wanted, own_names
 from hood.mesh.editing import repair
 from hood.mesh.editing.seams import Cut, Facing, Rims, Seam, along, along_corners, cut_edges, find_facing, find_rims
-from hood.mesh.flat import SIDES
+from hood.mesh.flat import SIDE_TABLES
 from hood.mesh.parts import MeshPart, find_parts, part_labels, rim_length
 from hood.mesh.topology import unique_edges
 
@@ -152,7 +152,7 @@ def _with_cut(garment: Garment, cut: Cut) -> Garment:
         corners, values = along_corners(cut, np.arange(3 * len(garment.flat)).reshape(-1, 3), garment.flat.reshape(-1, 2))
         rows["flat"] = values[corners]
     whole = (cut.corners == np.arange(garment.faces.size).reshape(-1, 3)[cut.parent]).all(axis=1, keepdims=True)
-    for key, plain in SIDES.items():
+    for key, plain in SIDE_TABLES.items():
         if getattr(garment, key) is not None:
             rows[key] = np.where(whole, getattr(garment, key)[cut.parent], plain)
     panels = {name: mask[cut.parent] for name, mask in (garment.panels or {}).items()} or None

@@ -16,7 +16,7 @@ from hood.assets.garment.record import Fitting
 from hood.mesh import topology
 from hood.mesh.editing import repair
 from hood.mesh.editing.repair import turn_caps
-from hood.mesh.flat import SIDES
+from hood.mesh.flat import SIDE_TABLES
 
 #: A garment whose middle vertex is farther from the skin than this [m] was made for another place or body.
 _FARTHEST = 0.35
@@ -219,7 +219,7 @@ def turn_flat_faces(garment: Garment) -> tuple[Garment, int]:
 
     Their stiffness across is without bounds. Vertices keep their numbers. What has numbers of the sides of its faces stays.
     """
-    if garment.flat is not None or any(getattr(garment, key) is not None for key in SIDES):
+    if garment.flat is not None or any(getattr(garment, key) is not None for key in SIDE_TABLES):
         return garment, 0
     corners, parent, count = turn_caps(garment.rest_pos, garment.faces)
     if not count:
@@ -260,7 +260,7 @@ _PER_VERTEX = (
     "rest_pos", "pinned", "lbs_weights", "shapedirs", "colours", "skin_pos", "rest_turn", "piece", "region", "stiffness",
     "thickness",
 )  # fmt: skip
-_PER_FACE = ("faces", "uv_faces", "normal_faces", "flat", *SIDES)
+_PER_FACE = ("faces", "uv_faces", "normal_faces", "flat", *SIDE_TABLES)
 
 
 def keep_vertices(garment: Garment, faces: np.ndarray, kept: np.ndarray, number: np.ndarray) -> Garment:

@@ -17,7 +17,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.pins import MARKS
 from hood.assets.motion.sequence import PoseSequence
-from hood.mesh.flat import SIDES
+from hood.mesh.flat import SIDE_TABLES
 
 _SIDES = np.array([-1.0, 1.0, 1.0])
 
@@ -31,7 +31,7 @@ def _other_side(name: str) -> str:
 #: Region (len(MARKS),) that each region becomes in a mirror.
 _OTHER_SIDE = np.array([MARKS.index(_other_side(name)) for name in MARKS])
 #: Corner tables of a garment: turned over with its faces.
-_CORNERS = ("faces", "uv_faces", "normal_faces", *SIDES)
+_CORNERS = ("faces", "uv_faces", "normal_faces", *SIDE_TABLES)
 
 
 def reflect(values: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ def mirror_garment(garment: Garment) -> Garment:
 
 
 #: Corner tables of a garment: turned over with its faces.
-_CORNERS = ("faces", "uv_faces", "normal_faces", *SIDES)
+_CORNERS = ("faces", "uv_faces", "normal_faces", *SIDE_TABLES)
 
 
 def _reversed(faces: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from hood.assets.garment.garment import Garment
-from hood.mesh.flat import SIDES
+from hood.mesh.flat import SIDE_TABLES
 from hood.mesh.parts import join_riders
 
 
@@ -49,7 +49,7 @@ def join_garments(garments: Sequence[Garment]) -> Garment:
         fasteners=_join_fasteners(garments, starts),
         panels=_join_panels(garments),
         flat=_join_faces(garments, "flat", np.full((3, 2), np.nan)),  # those without keep the rest shape of their mesh
-        **{key: _join_faces(garments, key, np.full(3, plain)) for key, plain in SIDES.items()},
+        **{key: _join_faces(garments, key, np.full(3, plain)) for key, plain in SIDE_TABLES.items()},
         thickness=_join_rows(garments, "thickness", lambda garment: np.zeros(len(garment.rest_pos))),
         riders=join_riders([garment.riders for garment in garments], starts.tolist(), _uv_starts(garments)),
         file_numbers=_join_numbers(garments, starts),

@@ -9,6 +9,7 @@ and how stiff seams and hems are.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,11 +19,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
 from hood.assets.pattern.making import EdgeMaking, Fold, edge_making, panel_making, stitch_making
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
 MOST_GATHERED = 4.0
+#: Height [m] of the body that patterns are placed around that do not say.
+BODY_HEIGHT = 1.72
 #: Points of a curve that measure its length and find where outlines cross.
 _POINTS = 33
 #: Edges shorter than this [m] are none. A pattern has units of at most so many metres.
@@ -130,11 +134,12 @@ class Stitch:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Panels by name and their stitches."""
+    """Panels by name and their stitches; ``height`` [m] is that of the body around which they are placed."""
 
     name: str
     panels: Mapping[str, PatternPanel]
     stitches: tuple[Stitch, ...]
+    height: float = BODY_HEIGHT
 
 
 def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
@@ -163,8 +168,8 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     table = content.get("pattern") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("panels"), dict) and table["panels"]):
         raise ValueError(f"{path}: no pattern.panels; give a GarmentCode specification.json")
-    properties = content.get("properties")
-    units = properties.get("units_in_meter", 100) if isinstance(properties, dict) else 100
+    properties = content.get("properties") if isinstance(content.get("properties"), dict) else {}
+    units = properties.get("units_in_meter", 100)
     if isinstance(units, bool) or not isinstance(units, (int, float)) or not 0.1 <= units <= 1e4:
         raise ValueError(f"{path}: properties.units_in_meter is {units!r}; write 100 for centimetres")
     panels = {name: _panel(f"{path}: panel {name!r}", name, own, 1.0 / units) for name, own in table["panels"].items()}
@@ -172,7 +177,10 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     if not isinstance(stitches, list):
         raise ValueError(f"{path}: pattern.stitches is no list; write [[{{panel, edge}}, {{panel, edge}}], …]")
     found = tuple(_stitch(f"{path}: stitch {number}", own, panels) for number, own in enumerate(stitches))
-    pattern = Pattern(path.parent.name if path.stem == "specification" else path.stem, panels, found)
+    height = float(_numbers(f"{path}: properties.body_height", properties.get("body_height", BODY_HEIGHT * units), ())) / units
+    if not 0.3 <= height <= 3.0:
+        raise ValueError(f"{path}: properties.body_height is {height:g} m; give the height of the body, in the file's unit")
+    pattern = Pattern(path.parent.name if path.stem == "specification" else path.stem, panels, found, height)
     _check_stitches(str(path), pattern, most_gathered)
     return pattern
 
@@ -205,7 +213,8 @@ def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     edges, numbers = [], _loop(where, ends)
     for number in numbers:
         edge, there = own["edges"][number], f"{where}, edge {number}"
-        plain = _edge(there, edge, *vertices[list(ends[number])], scale)
+        start, end = vertices[list(ends[number])]
+        plain = _edge(there, edge, start, end, scale)
         edges.append(replace(plain, making=edge_making(there, edge, scale)))
         if edges[-1].length < _SHORTEST:
             raise ValueError(f"{there} has no length; merge its two vertices")
@@ -313,3 +322,72 @@ def _check_stitches(where: str, pattern: Pattern, most: float) -> None:
                 for (name, place), length in zip((stitch.first, stitch.second), lengths, strict=True)
             )
             raise ValueError(f"{where}: stitch {number} joins {sides}, more than {most:g} times as long; change one of them")
+
+
+def check_pattern(where: str, pattern: Pattern, most_gathered: float = MOST_GATHERED) -> None:
+    """Raise ValueError, as :func:`read_pattern` does, unless a pattern that was made in memory can be sewn."""
+    for name, panel in pattern.panels.items():
+        there = f"{where}: panel {name!r}"
+        short = next((k for k, edge in enumerate(panel.edges) if edge.length < _SHORTEST), None)
+        if short is not None:
+            raise ValueError(f"{there}, edge {panel.numbers[short]} has no length; merge its two vertices")
+        _check_outline(there, list(panel.edges), list(panel.numbers))
+    _check_stitches(where, pattern, most_gathered)
+
+
+def write_pattern(path: Path, pattern: Pattern) -> None:
+    """Write a GarmentCode ``specification.json`` in centimetres, which :func:`read_pattern` reads back.
+
+    Edges stand in the order of the loop; an existing file is replaced at once or not at all.
+
+    Raises:
+        ValueError: an edge whose curve has more than two control points, which the format has not.
+    """
+    panels = {}
+    for name, panel in pattern.panels.items():
+        edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of turns for which several triples of angles stand
+            angles = Rotation.from_matrix(panel.rotation).as_euler("xyz", degrees=True)
+        panels[name] = {
+            "translation": _rounded(100.0 * panel.translation),
+            "rotation": _rounded(angles),
+            "vertices": [_rounded(100.0 * edge.start) for edge in panel.edges],
+            "edges": edges,
+            "label": panel.label,
+        }
+    stitches: list[list[Any]] = []
+    for stitch in pattern.stitches:
+        sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
+        stitches.append([*sides, "right_wrong"] if stitch.same else sides)
+    properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
+    properties["body_height"] = round(100.0 * pattern.height, 10)
+    content = {
+        "pattern": {"panels": panels, "stitches": stitches, "panel_order": list(panels)},
+        "parameters": {},
+        "parameter_order": [],
+        "properties": {**properties, "normalized_edge_loops": True},
+    }
+    write_atomically(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """Numbers as they are written: a picometre is less than their rounding."""
+    return [round(float(value), 10) + 0.0 for value in values]
+
+
+def _written(where: str, number: int, count: int, edge: Edge) -> dict[str, Any]:
+    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count]}
+    if edge.arc is not None:
+        radius, large, right = edge.arc
+        content["curvature"] = {"type": "circle", "params": [100.0 * radius, int(large), int(right)]}
+    elif len(edge.curve):
+        if len(edge.curve) > 2:
+            raise ValueError(f"{where} has {len(edge.curve)} control points; the format has one or two")
+        way = edge.end - edge.start
+        axes = np.stack([way, [-way[1], way[0]]], axis=1) / float(way @ way)
+        params = [[float(value) for value in point] for point in (edge.curve - edge.start) @ axes]
+        content["curvature"] = {"type": "quadratic" if len(params) == 1 else "cubic", "params": params}
+    if edge.label:
+        content["label"] = edge.label
+    return content

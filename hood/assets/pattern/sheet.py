@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
 from hood.assets.pattern.making import construction_of
-from hood.assets.pattern.pattern import Pattern, PatternPanel
+from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
 from hood.mesh.flat import Construction
 
@@ -21,6 +21,8 @@ _FROM_OUTLINE = 0.6
 _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
+#: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
+_CURVED, _AT_ONCE = 32, 1 << 21
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,11 @@ class PatternSheet:
         faces: (F, 3), wound along the outlines of the panels.
         uv: (U, 2) m, the panels side by side; ``uv_faces`` (F, 3) are the corners of the faces there.
         panels: (F,) bool each.
+        outline: (U,) where a point of ``uv`` is on the outline of its panel: the number of the side and the share of its
+            length; NaN inside.
         seam: (V,) bool, vertices of a stitch.
         edge_labels: (V,) bool by label of an edge, the vertices along it.
+        height: m, of the body around which the panels are placed.
         made: its elastic, its folds and how stiff its seams and hems are.
         stiffness: (V,) how many times as stiff as the fabric the cloth is; None: once.
     """
@@ -43,8 +48,10 @@ class PatternSheet:
     uv: np.ndarray
     uv_faces: np.ndarray
     panels: Mapping[str, np.ndarray]
+    outline: np.ndarray
     seam: np.ndarray
     edge_labels: Mapping[str, np.ndarray]
+    height: float = BODY_HEIGHT
     made: Construction = Construction()
     stiffness: np.ndarray | None = None
 
@@ -61,6 +68,13 @@ class PatternSheet:
             found[self.faces[(self.made.elastic != 1.0).any(axis=1)]] = True
         return found
 
+    @property
+    def welds(self) -> np.ndarray:
+        """(U,) vertex of every point of ``uv``."""
+        vertex = np.zeros(len(self.uv), dtype=np.int64)
+        vertex[self.uv_faces] = self.faces
+        return vertex
+
 
 def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     """The pattern meshed with edges of about ``edge`` [m], sewn.
@@ -75,7 +89,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     ends = {panel.name: _fold_ends(panel, edge) for panel in pattern.panels.values()}
     shares = _divisions(pattern, edge, ends)
     tables, faces, outlines, creases, start = [], [], {}, {}, 0
-    placed, owner = [], []
+    placed, owner, places = [], [], []
     labels: dict[str, list[np.ndarray]] = {}
     at = 0.0
     for number, panel in enumerate(pattern.panels.values()):
@@ -86,9 +100,12 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
             outlines[panel.name, k] = start + side
             if panel.edges[k].label:
                 labels.setdefault(panel.edges[k].label, []).append(start + side)
-        low = points.min(axis=0)
-        tables.append(points - low + [at, 0.0])
-        at += float(np.ptp(points[:, 0])) + _MARGIN
+        places.append(np.full(len(points), np.nan))
+        for k, side in enumerate(sides):
+            places[-1][side[:-1]] = k + own[k][:-1]
+        exact = np.concatenate([side.evenly(_CURVED) for side in panel.edges])
+        tables.append(points - exact.min(axis=0) + [at, 0.0])  # in one place, whatever the edge length
+        at += float(np.ptp(exact[:, 0])) + _MARGIN
         placed.append(panel.placed(points))
         faces.append(triangles + start)
         owner.append(np.full(len(triangles), number))
@@ -116,7 +133,60 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
     parts = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(middle, welded, np.concatenate(tables), corners, parts, seam, marks, made)
+    return PatternSheet(
+        middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
+    )
+
+
+def carried(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
+    """(V, 3) m: the vertices of ``fine`` on ``coarse``, another mesh of the same pattern, whose vertices are at ``pos`` (W, 3).
+
+    On the outline of a panel they keep their side and their share of its length, so that both sides of a stitch agree; inside
+    they keep their place in the flat triangles.
+    """
+    total, count = np.zeros((len(fine.pos), 3)), np.zeros(len(fine.pos))
+    at, welds = pos[coarse.welds], fine.welds
+    for name, mask in fine.panels.items():
+        rows, own = np.unique(fine.uv_faces[mask]), coarse.uv_faces[coarse.panels[name]]
+        on_rim = ~np.isnan(fine.outline[rows])
+        ring = np.unique(own)
+        ring = ring[~np.isnan(coarse.outline[ring])]
+        ring = ring[np.argsort(coarse.outline[ring])]
+        ring = np.append(ring, ring[0])
+        way = coarse.outline[ring]
+        way[-1] = np.floor(way[-2]) + 1.0
+        rim, inner = rows[on_rim], rows[~on_rim]
+        found = np.zeros((len(rows), 3))
+        found[on_rim] = _along(way, at[ring], fine.outline[rim])
+        if len(inner):
+            # Curves are chords in the coarse mesh: points beside them move with them.
+            shift = _along(way, coarse.uv[ring], fine.outline[rim]) - fine.uv[rim]
+            distance, nearest = cKDTree(fine.uv[rim]).query(fine.uv[inner])
+            reach = np.sqrt(np.abs(np.linalg.det(coarse.uv[own][:, 1:] - coarse.uv[own][:, :1])).mean())
+            share = np.clip(1.0 - distance / reach, 0.0, 1.0)
+            face, bary = _in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
+            found[~on_rim] = np.einsum("nk,nkx->nx", bary, at[own[face]])
+        np.add.at(total, welds[rows], found)
+        np.add.at(count, welds[rows], 1.0)
+    return total / count[:, None]
+
+
+def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """``values`` (K, n) at the places ``way`` (K,), read between them (N, n)."""
+    return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
+
+
+def _in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
+    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
+    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
+        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
+        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
+        face[rows] = bary.min(axis=2).argmax(axis=1)
+        weights[rows] = bary[np.arange(len(rows)), face[rows]]
+    weights = weights.clip(min=0.0)
+    return face, weights / weights.sum(axis=1, keepdims=True)
 
 
 #: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.

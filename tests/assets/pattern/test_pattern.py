@@ -14,7 +14,7 @@ from sewing_patterns import PATTERNS, panel, skirt, specification, write
 from hood.assets.material import Material
 from hood.assets.pattern.making import with_elastic
 from hood.assets.pattern.pattern import Edge, read_pattern
-from hood.assets.pattern.sheet import PatternSheet, sheet_of
+from hood.assets.pattern.sheet import PatternSheet, carried, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.mesh import topology
 from hood.mesh.flat import stretched_sides
@@ -112,6 +112,24 @@ def test_right_to_wrong_runs_in_one_direction(tmp_path: Path) -> None:
     assert np.allclose(seam[:, 0], 0.4)
     assert np.allclose(seam[:, 2], 0.025)
     assert np.allclose(np.sort(seam[:, 1]), np.linspace(0.0, 0.3, len(seam)))
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_a_mesh_lies_on_itself(name: str, tmp_path: Path) -> None:
+    sheet = _sheet(tmp_path, PATTERNS[name]())
+    np.testing.assert_allclose(carried(sheet, sheet.pos, sheet), sheet.pos, atol=1e-9)
+
+
+def test_a_finer_mesh_keeps_its_place_in_the_panel(tmp_path: Path) -> None:
+    curved = {0: [0.5, -0.3], 1: {"type": "circle", "params": [25.0, 0, 1]}, 3: [0.5, 0.3]}
+    content = specification({"a": panel([[0, 0], [40, 0], [40, 30], [0, 30]], curved)}, [])
+    coarse, fine = _sheet(tmp_path, content, 0.05), _sheet(tmp_path, content, 0.013)
+    assert len(fine.pos) > 5 * len(coarse.pos)
+    found = carried(coarse, coarse.pos, fine)
+    assert np.abs(found - fine.pos).max() < 4e-3  # the chords of the curves
+    inside = np.linalg.norm(fine.pos[:, :2] - [0.2, 0.13], axis=1) < 0.08
+    assert inside.sum() > 50
+    np.testing.assert_allclose(found[inside], fine.pos[inside], atol=1e-9)
 
 
 def _spoiled(change: Any) -> dict[str, Any]:
