@@ -329,7 +329,7 @@ def sleeves(
         t.draw(f"left_sleeve_{name}", outline, angles, at, "arm")
         t.mirror(f"left_sleeve_{name}", f"right_sleeve_{name}")
         if cuff:
-            band = 0.5 * arm * 1.25
+            band = 0.5 * arm * 1.45
             sides = [Side("rim", (0.0, -length - cuff)), Side("under", (band, -length - cuff)), Side("upper", (band, -length))]
             sides.append(Side("over", (0.0, -length)))
             t.draw(f"left_cuff_{name}", sides if back else mirrored(sides), angles, at, "arm")
