@@ -27,9 +27,13 @@ from types import FrameType
 
 import numpy as np
 import torch
+import yaml
 
 import hood
 from hood.assets.garment.garment import load_garment
+from hood.assets.pattern.designs import draft
+from hood.assets.pattern.measures import measure_body
+from hood.assets.pattern.sheet import sheet_of
 from hood.cli.main import main as run_hood
 from hood.mesh.flat import edge_lengths
 from hood.mesh.topology import unique_edges
@@ -130,12 +134,15 @@ def wear(path: Path, motion: str, beta: float, frames: int) -> str:
     return "sound" if summary["sound"] else "unsound: " + "; ".join(summary["unsound_reasons"])
 
 
-def off_pattern(path: Path) -> tuple[float, float]:
-    """How far a garment is from its flat pattern in a scene: lengths at rest as a share, its grain in degrees."""
-    garment = load_garment(path)
-    assert garment.flat is not None
-    scene = hood.build_scene(garment, hood.load_body(), hood.load_sequence("plie"), hood.Material(warp=3.0))
-    corners = garment.flat[:, 1:] - garment.flat[:, :1]
+def off_pattern(path: Path, row: Row, edge: float) -> tuple[float, float]:
+    """How far a garment is from its pattern, on the body that it was made for: lengths at rest as a share, grain in degrees."""
+    body, betas, garment = hood.load_body(), np.array([row.beta]), load_garment(path)
+    vertices, joints = body.shaped(betas)
+    options = yaml.safe_load("{" + row.options.replace(":", ": ") + "}")
+    sheet = sheet_of(draft(row.design, measure_body(vertices, body.faces, joints), options), edge, row.design)
+    scene = hood.build_scene(garment, body, hood.load_sequence("plie"), hood.Material(warp=3.0), betas=betas)
+    corners = sheet.flat[:, 1:] - sheet.flat[:, :1]
+    assert np.array_equal(sheet.faces, garment.faces)
     faces = torch.as_tensor(garment.faces)
     lengths = edge_lengths(torch.as_tensor(corners), faces, torch.as_tensor(unique_edges(garment.faces)))
     assert scene.cloth.grain is not None
@@ -189,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     rows.append(row)
                     print(line(row), flush=True)
                     if chosen.wear and path.exists() and not row.faults:
-                        length, grain = off_pattern(path)
+                        length, grain = off_pattern(path, row, chosen.edge)
                         bad += length > LENGTH or grain > GRAIN
                         verdicts = ", ".join(f"{motion}: {wear(path, motion, beta, chosen.frames)}" for motion in chosen.wear)
                         print(f"  lengths at rest off by {length:.3%}, grain by {grain:.2f}°; {verdicts}", flush=True)

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import Edge, PatternPanel, Stitch
 
-Point = tuple[float, float]
+XY = tuple[float, float]
 Place = tuple[float, float, float]
 #: A panel, and a side of it.
-Key = tuple[str, str]
+SideKey = tuple[str, str]
 #: Panels begin so far [m] before and behind the trunk; those of a sleeve from the skin of the arm.
 _APART, _FROM_ARM = 0.05, 0.035
 #: Sleeves are longer than the arm by so much [m], which a raised arm takes.
@@ -35,8 +35,8 @@ class Side(NamedTuple):
     """A side of a panel: its key, where it starts, and the control points of its Bézier curve."""
 
     key: str
-    start: Point
-    curve: tuple[Point, ...] = ()
+    start: XY
+    curve: tuple[XY, ...] = ()
 
 
 Outline = Sequence[Side]
@@ -77,21 +77,21 @@ class Table:
         self._keys[other] = self._keys[name][::-1]
         self._sew_darts(other)
 
-    def keys(self, name: str, beginning: str) -> list[Key]:
+    def keys(self, name: str, beginning: str) -> list[SideKey]:
         """The sides of a panel whose keys begin so, from the right of the body to its left for a panel in front, and from its
         left to its right for one behind: as the panel is seen."""
         panel, found = self.panels[name], [key for key in self._keys[name] if _bare(key).startswith(beginning)]
         middle = {key: float(panel.edges[self._keys[name].index(key)].at(np.array([0.5]))[0, 0]) for key in found}
         return [(name, key) for key in sorted(found, key=lambda key: middle[key])]
 
-    def lengths(self, sides: Sequence[Key]) -> list[float]:
+    def lengths(self, sides: Sequence[SideKey]) -> list[float]:
         return [self.panels[name].edges[self._keys[name].index(key)].length for name, key in sides]
 
-    def sew(self, first: Key, second: Key, same: bool = False) -> None:
+    def sew(self, first: SideKey, second: SideKey, same: bool = False) -> None:
         ends = [(name, self._keys[name].index(key)) for name, key in (first, second)]
         self.stitches.append(Stitch(ends[0], ends[1], same))
 
-    def sew_all(self, first: Sequence[Key], second: Sequence[Key]) -> None:
+    def sew_all(self, first: Sequence[SideKey], second: Sequence[SideKey]) -> None:
         for one, other in zip(first, second, strict=True):
             self.sew(one, other)
 
@@ -116,11 +116,11 @@ def _label(key: str) -> str:
     return next((label.format(side) for begin, label in _LABELS.items() if _bare(key).startswith(begin)), "")
 
 
-def _flipped(points: Sequence[Point]) -> tuple[Point, ...]:
+def _flipped(points: Sequence[XY]) -> tuple[XY, ...]:
     return tuple((-x, y) for x, y in reversed(points))
 
 
-def whole(half: Outline, end: Point, back: bool = False) -> list[Side]:
+def both_halves(half: Outline, end: XY, back: bool = False) -> list[Side]:
     """The outline of a panel across the middle, from that of its half at positive x: from the middle below to ``end``, the
     middle above. A panel behind the body is seen from there: its positive x is the right of the body."""
     near, far = ("right", "left") if back else ("left", "right")
@@ -130,14 +130,14 @@ def whole(half: Outline, end: Point, back: bool = False) -> list[Side]:
     return mine + [Side(f"{far}_{side.key}", (-stop[0], stop[1]), _flipped(side.curve)) for side, stop in pairs]
 
 
-def place(m: Measures, back: bool) -> tuple[Place, Place]:
+def trunk_place(m: Measures, back: bool) -> tuple[Place, Place]:
     """Angles and translation of a panel before the trunk or behind it, whose y is the height above the floor."""
     if back:
         return (0.0, 180.0, 0.0), (0.0, 0.0, m.back - _APART)
     return (0.0, 0.0, 0.0), (0.0, 0.0, m.front + _APART)
 
 
-def strip(
+def draw_strip(
     t: Table, name: str, above: Sequence[float], below: Sequence[float], height: float, bottom: float, at: tuple[Place, Place]
 ) -> None:
     """A strip of cloth, its upper and lower edge divided into pieces of those lengths [m], from left to right as it is seen."""
@@ -155,11 +155,11 @@ def strip(
     t.draw(name, sides, *at)
 
 
-def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[Key]], height: float, top: float) -> None:
+def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[SideKey]], height: float, top: float) -> None:
     """A waistband of two strips over edges of the front (False) and of the back (True)."""
     for back, below in edges.items():
         name, lengths = f"band_{'back' if back else 'front'}", t.lengths(below)
-        strip(t, name, [sum(lengths)], lengths, height, top - height, place(m, back))
+        draw_strip(t, name, [sum(lengths)], lengths, height, top - height, trunk_place(m, back))
         t.sew_all(below, t.keys(name, "below"))
     t.sew_keys("band_front", "band_back", ["side"])
 
@@ -167,7 +167,7 @@ def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[Key]], height: flo
 def tiers(
     t: Table,
     m: Measures,
-    edges: Mapping[bool, Sequence[Key]],
+    edges: Mapping[bool, Sequence[SideKey]],
     top: float,
     length: float,
     count: int,
@@ -179,7 +179,7 @@ def tiers(
         for back, above in edges.items():
             names[back] = name = f"tier{number}_{'back' if back else 'front'}"
             pieces = [gathers * part for part in t.lengths(above)]
-            strip(t, name, pieces, [sum(pieces)], length / count, top - number * length / count, place(m, back))
+            draw_strip(t, name, pieces, [sum(pieces)], length / count, top - number * length / count, trunk_place(m, back))
             t.sew_all(above, t.keys(name, "above") or t.keys(name, "top"))
         t.sew_keys(names[False], names[True], ["side"])
         edges = {back: t.keys(name, "below") for back, name in names.items()}
@@ -194,7 +194,7 @@ class Neck(NamedTuple):
     shape: str = "round"
 
 
-def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: Point | None = None) -> tuple[list[Side], Point]:
+def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: XY | None = None) -> tuple[list[Side], XY]:
     """Armhole, shoulder and neckline of half a bodice, and where that ends; the side seam comes from ``below``."""
     over = m.back_length if back else float(np.clip(m.front_length, m.back_length - 0.01, m.back_length + 0.025))
     top, slope = m.waist_height + over, max(m.neck_height - m.shoulder_height, 0.01)
@@ -211,7 +211,7 @@ def upper_half(m: Measures, back: bool, ease: float, neck: Neck, below: Point | 
     return [Side("armhole", armpit, armhole), Side("shoulder", _point(tip)), Side("neck", _point(side), curve)], low
 
 
-def _fitted(below: Point, low: Point, high: Point, waist: Point, fit: float) -> tuple[Point, ...]:
+def _fitted(below: XY, low: XY, high: XY, waist: XY, fit: float) -> tuple[XY, ...]:
     """Control points of a side seam that goes on from ``below`` and comes nearer to the waist where that is well between."""
     rise, share = high[1] - low[1], (waist[1] - low[1]) / (high[1] - low[1])
     if fit == 0.0 or not 0.25 < share < 0.75:
@@ -224,7 +224,7 @@ def _fitted(below: Point, low: Point, high: Point, waist: Point, fit: float) -> 
     return (first, low[1] + rise / 3.0), (second, low[1] + 2.0 * rise / 3.0)
 
 
-def _onward(below: Point, low: Point, high: Point) -> tuple[Point, Point]:
+def _onward(below: XY, low: XY, high: XY) -> tuple[XY, XY]:
     """Control points of a side that goes on from ``below`` at ``low`` and bends to ``high``, where a waist is."""
     rise = high[1] - low[1]
     lean = (low[0] - below[0]) / (low[1] - below[1])
@@ -236,7 +236,7 @@ def _dart(width: float) -> float:
     return 0.0 if width < 0.01 else min(width, 0.035)
 
 
-def _point(array: np.ndarray) -> Point:
+def _point(array: np.ndarray) -> XY:
     return float(array[0]), float(array[1])
 
 
@@ -253,7 +253,7 @@ def torso(t: Table, m: Measures, ease: float, length: float, neck: Neck, fit: fl
         curve = _fitted(sides[0].start if sides else low, low, armpit, (0.25 * m.waist * (1.0 + ease), m.waist_height), fit)
         upper, end = upper_half(m, back, ease, neck, curve[-1] if curve else low)
         half = [Side("hem", (0.0, hem)), *sides, Side("side1", low, curve), *upper]
-        t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
+        t.draw("back" if back else "front", both_halves(half, end, back), *trunk_place(m, back))
     t.sew_keys("front", "back", ["side", "shoulder"])
 
 
@@ -271,7 +271,7 @@ def bodice(t: Table, m: Measures, ease: float, neck: Neck) -> tuple[float, float
             Side("side", (waist + dart, low)),
             *upper,
         ]
-        t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
+        t.draw("back" if back else "front", both_halves(half, end, back), *trunk_place(m, back))
     t.sew_keys("front", "back", ["side", "shoulder"])
     return inner, waist - inner
 
@@ -329,7 +329,7 @@ def sleeves(
         t.draw(f"left_sleeve_{name}", outline, angles, at, "arm")
         t.mirror(f"left_sleeve_{name}", f"right_sleeve_{name}")
         if cuff:
-            band = 0.5 * arm * 1.25
+            band = 0.5 * arm * 1.45
             sides = [Side("rim", (0.0, -length - cuff)), Side("under", (band, -length - cuff)), Side("upper", (band, -length))]
             sides.append(Side("over", (0.0, -length)))
             t.draw(f"left_cuff_{name}", sides if back else mirrored(sides), angles, at, "arm")
@@ -368,7 +368,7 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
         Side("waist0", (inner, top)),
     ]
     for back in (False, True):
-        t.draw(f"skirt_{'back' if back else 'front'}", whole(half, (0.0, top), back), *place(m, back))
+        t.draw(f"skirt_{'back' if back else 'front'}", both_halves(half, (0.0, top), back), *trunk_place(m, back))
     t.sew_keys("skirt_front", "skirt_back", ["side"])
 
 
@@ -404,7 +404,7 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         more = 0.0 if bends else (1.0 - share) * (reach - 0.055 * m.hips)
         joint = (outer - knee, m.knee_height) if bends else (hem_out - wide - more, low)
 
-        def inner(height: float, joint: Point = joint, reach: float = reach) -> Edge:
+        def inner(height: float, joint: XY = joint, reach: float = reach) -> Edge:
             bend = (joint[0] - 0.25 * (joint[0] + reach), joint[1] + 0.55 * (height - joint[1]))
             return Edge(np.array([-reach, height]), np.array(joint), np.array([bend]))
 
@@ -425,7 +425,7 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         if bends:
             sides.append(Side("inner0", joint))
         own, name = ("right", "back") if back else ("left", "front")
-        angles, at = place(m, back)
+        angles, at = trunk_place(m, back)
         aside = max(m.stance - outer + 0.5 * knee, 0.015)  # around the leg of a body that stands with its legs apart
         t.draw(f"{own}_leg_{name}", sides, angles, (-aside if back else aside, *at[1:]), "leg")
         t.mirror(f"{own}_leg_{name}", f"{_other(own)}_leg_{name}")
@@ -435,7 +435,7 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         t.sew_keys(f"left_leg_{name}", f"right_leg_{name}", ["centre", "crotch"])
 
 
-def _slanted(middle: Point, corner: Point, pieces: tuple[float, float], depth: float) -> list[Side]:
+def _slanted(middle: XY, corner: XY, pieces: tuple[float, float], depth: float) -> list[Side]:
     """The waist of a leg from its corner at the side to the middle: two pieces and a dart between them."""
     (inner, outer), side = pieces, np.array(corner)
     way = np.array(middle) - side

@@ -13,23 +13,23 @@ from scipy.spatial.transform import Rotation
 
 from hood.assets.files.library import nearest, unknown
 from hood.assets.pattern.blocks import (
-    Key,
+    XY,
     Leg,
     Neck,
-    Point,
     Side,
+    SideKey,
     Table,
     band,
     bodice,
+    both_halves,
+    draw_strip,
     legs,
-    place,
     skirt,
     sleeves,
-    strip,
     tiers,
     torso,
+    trunk_place,
     upper_half,
-    whole,
 )
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import MOST_GATHERED, Pattern, check_pattern
@@ -57,7 +57,7 @@ MEANINGS = {
     "knee": "what the leg is wider than the knee, as a share",
     "hem": "width of the leg at its hem, as a share of that above it",
 }
-Range = tuple[float, float, float] | tuple[str, ...]
+Choices = tuple[float, float, float] | tuple[str, ...]
 #: Chosen options: numbers and words by their names.
 Options = SimpleNamespace
 
@@ -67,7 +67,7 @@ class Design:
     """A design: how it is drawn, and its options: (default, least, most) of numbers, else words of which the first is taken."""
 
     draw: Callable[[Table, Measures, Options], None]
-    options: Mapping[str, Range]
+    options: Mapping[str, Choices]
 
 
 #: Every design by name.
@@ -132,22 +132,22 @@ def _checked(name: str, key: str, value: Any) -> float | str:
     return float(value)
 
 
-def _design(**options: Range) -> Callable[[Callable[[Table, Measures, Options], None]], None]:
+def _design(**options: Choices) -> Callable[[Callable[[Table, Measures, Options], None]], None]:
     """Enter a function as the design of its name."""
 
     def enter(draw: Callable[[Table, Measures, Options], None]) -> None:
-        DESIGNS[draw.__name__.strip("_")] = Design(draw, options)
+        DESIGNS[draw.__name__.removeprefix("_")] = Design(draw, options)
 
     return enter
 
 
-def _gores(t: Table, ring: float, circle: float, length: float, top: Point, least: float = 0.0) -> None:
+def _gores(t: Table, ring: float, circle: float, length: float, top: XY, least: float = 0.0) -> None:
     """Four sectors of a share of a circle, sewn to a ring around an edge of length ``ring`` [m] at ``top``, its y and z; each
     has two pieces there. They begin as a pyramid, tilted outwards by ``least`` [degrees] at least."""
     half, inner, off = 0.25 * math.pi * circle, ring / (2.0 * math.pi * circle), ring / (2.0 * math.pi) + 0.02
     tilt = math.degrees(math.asin(min(max(((inner + length) * math.sin(half) + 0.01 - off) / length, 0.0), 0.9)))
 
-    def arc(radius: float, first: float, last: float) -> tuple[Point, tuple[Point, Point]]:
+    def arc(radius: float, first: float, last: float) -> tuple[XY, tuple[XY, XY]]:
         """Start and control points of an arc below the centre, between two angles from straight down."""
         a, b, k = first, last, 4.0 / 3.0 * math.tan(0.25 * (last - first)) * radius
         start, end = (radius * math.sin(a), -radius * math.cos(a)), (radius * math.sin(b), -radius * math.cos(b))
@@ -176,13 +176,13 @@ def _gores(t: Table, ring: float, circle: float, length: float, top: Point, leas
         t.sew((name, "ahead"), (other, "behind"))
 
 
-def _gore_waist(t: Table, back: bool) -> list[Key]:
+def _gore_waist(t: Table, back: bool) -> list[SideKey]:
     """The waist of the gores in front or behind, as they are seen."""
     names = ("gore_back_left", "gore_back_right") if back else ("gore_front_right", "gore_front_left")
     return [side for name in names for side in t.keys(name, "waist")]
 
 
-def _leg_waist(t: Table, back: bool) -> list[Key]:
+def _leg_waist(t: Table, back: bool) -> list[SideKey]:
     """The waist of trousers in front or behind, as it is seen."""
     names = ("left_leg_back", "right_leg_back") if back else ("right_leg_front", "left_leg_front")
     return [side for name in names for side in t.keys(name, "waist")]
@@ -231,9 +231,9 @@ def _collar(t: Table, m: Measures, height: float) -> None:
         name = "back" if back else "front"
         below = t.keys(name, "neck")
         lengths = t.lengths(below)
-        angles, at = place(m, back)
+        angles, at = trunk_place(m, back)
         shift = (at[0], at[1], m.shoulder[2] + (-0.1 if back else 0.1))
-        strip(t, f"collar_{name}", lengths, lengths, height, m.neck_height, (angles, shift))
+        draw_strip(t, f"collar_{name}", lengths, lengths, height, m.neck_height, (angles, shift))
         t.sew_all(below, t.keys(f"collar_{name}", "below"))
     t.sew_keys("collar_front", "collar_back", ["side"])
 
@@ -293,7 +293,7 @@ def _hood(t: Table, m: Measures) -> None:
     t.sew(("left_hood", "seam"), ("right_hood", "seam"))
 
 
-_BODICE: dict[str, Range] = {
+_BODICE: dict[str, Choices] = {
     "ease": (0.08, 0.04, 0.3),
     "sleeve": (0.0, 0.0, 1.0),
     "wide": (1.0, 0.7, 2.0),
@@ -357,7 +357,7 @@ def _skirt_with_band(t: Table, m: Measures, o: Options) -> None:
     band(t, m, edges, o.band, m.waist_height + o.band)
 
 
-_SKIRT: dict[str, Range] = {"ease": (0.05, 0.02, 0.3), "length": (0.5, 0.3, 0.95), "band": (0.035, 0.03, 0.08)}
+_SKIRT: dict[str, Choices] = {"ease": (0.05, 0.02, 0.3), "length": (0.5, 0.3, 0.95), "band": (0.035, 0.03, 0.08)}
 
 
 @_design(**_SKIRT, flare=(0.3, 0.0, 1.2))
@@ -382,7 +382,7 @@ def _rows(t: Table, m: Measures, length: float, count: int, gathers: float, heig
     edges, half = {}, 0.51 * m.waist
     for back in (False, True):
         name = f"band_{'back' if back else 'front'}"
-        strip(t, name, [half], [half], height, m.waist_height, place(m, back))
+        draw_strip(t, name, [half], [half], height, m.waist_height, trunk_place(m, back))
         edges[back] = t.keys(name, "below")
     t.sew_keys("band_front", "band_back", ["side"])
     tiers(t, m, edges, m.waist_height, length * m.waist_height, count, gathers)
@@ -405,7 +405,7 @@ def _trousers_with_band(t: Table, m: Measures, o: Options, knee: float, hem: flo
     band(t, m, {back: _leg_waist(t, back) for back in (False, True)}, o.band, top + o.band)
 
 
-_LEGS: dict[str, Range] = {"rise": (-0.03, -0.07, 0.0), "band": (0.035, 0.03, 0.05)}
+_LEGS: dict[str, Choices] = {"rise": (-0.03, -0.07, 0.0), "band": (0.035, 0.03, 0.05)}
 
 
 @_design(**_LEGS, ease=(0.06, 0.02, 0.3), length=(0.93, 0.65, 0.97), knee=(0.3, 0.1, 1.0), hem=(0.95, 0.7, 1.8))
@@ -440,7 +440,7 @@ def _poncho(t: Table, m: Measures, o: Options) -> None:
         tip, inner = shoulder.start, neck.start
         drop = (inner[1] - tip[1]) / (inner[0] - tip[0]) * (wide - inner[0])
         half = [Side("hem", (0.0, hem)), Side("open", (wide, hem)), Side("shoulder", (wide, inner[1] + drop)), neck]
-        t.draw("back" if back else "front", whole(half, end, back), *place(m, back))
+        t.draw("back" if back else "front", both_halves(half, end, back), *trunk_place(m, back))
     t.sew_keys("front", "back", ["shoulder"])
 
 
