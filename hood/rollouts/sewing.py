@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 #: The thin body has one of these shares of the way from its bones to its skin, and grows by so much [m] a step at most.
 _GIRTHS, _GROWTH = (0.15, 0.3, 0.45, 0.6), 0.012
-#: In another attempt it has these.
-_THINNER, _SLOWER = 0.05, 0.006
+#: In the last attempt it grows by so much [m], within a coarse mesh of so many vertices.
+_SLOWER, _FINER = 0.006, 1600
 #: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body.
 _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
 #: A step in which a vertex goes farther than twice this [m] is taken again with half the time; steps grow while none does.
@@ -67,8 +67,9 @@ _COARSE, _LEAST_EDGE, _MOST_EDGE = 700, 0.022, 0.05
 _WAIST = 0.72
 #: Arms of the poses of the T and the A, degrees below the former.
 _TPOSE, _APOSE = 0.0, 45.0
-#: Legs of a body that puts on trousers are so far apart, degrees each: between thighs that touch there is no room for two seams.
-_APART = 5.0
+#: Legs of a body that puts on trousers end so far apart, degrees each, or else the second: between thighs that touch there is
+#: no room for two seams.
+_APART = (5.0, 10.0)
 #: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
 _BESIDE, _HIGH = 0.19, 0.9
 #: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
@@ -122,23 +123,24 @@ def sew(
         []
     """
     began = time.perf_counter()
-    coarse = _coarser(pattern, sheet)
+    coarse = _coarser(pattern, sheet, _COARSE)
     arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
     first = starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
     if _has_legs(coarse, first):
-        ways = [replace(first, posed=_standing(body, betas, arms[0], _APART)), first]
+        ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
         ways = [first, *(starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
-    ways.append(replace(ways[0], thin=_THINNER, growth=_SLOWER))
+    ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
+        coarse = coarse if way is not ways[-1] else _coarser(pattern, sheet, _FINER)
         rough = sewn = sew_around(coarse, way.posed, material, start=way)
         if coarse is not sheet and rough.figures.in_place:
             sewn = refined(coarse, rough, sheet, way, material)
-        tries.append((way, rough, sewn))
+        tries.append((way, coarse, rough, sewn))
         if not sewn.figures.faults:
             break
-    way, rough, sewn = min(tries, key=lambda one: one[2].figures.rank)
+    way, coarse, rough, sewn = min(tries, key=lambda one: one[3].figures.rank)
     if coarse is not sheet and sewn is rough:
         sewn = refined(coarse, rough, sheet, way, material)
     return way.posed, replace(sewn, seconds=time.perf_counter() - began)
@@ -158,10 +160,10 @@ def _has_legs(sheet: PatternSheet, start: Start) -> bool:
     return any(limbs_in(pos[loop], start.before) & {"left leg", "right leg"} for loop in boundary_loops(sheet.faces))
 
 
-def _coarser(pattern: Pattern, sheet: PatternSheet) -> PatternSheet:
-    """A mesh of the pattern with less than half the vertices, where one can be had; else ``sheet`` itself."""
+def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
+    """A mesh of the pattern of about ``count`` vertices, less than half of those of ``sheet``; else that itself."""
     area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
-    wide = min(max(math.sqrt(area / _COARSE / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
+    wide = min(max(math.sqrt(area / count / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
     while True:
         try:
             coarse = sheet_of(pattern, wide, pattern.name)

@@ -188,9 +188,7 @@ def _passes(start: np.ndarray, end: np.ndarray, middle: np.ndarray, rim: np.ndar
     return bool(int(hit.sum()) % 2)
 
 
-def _swapped(
-    faces: np.ndarray, before: PosedBody, begun: np.ndarray, posed: PosedBody, pos: np.ndarray
-) -> tuple[str, ...]:
+def _swapped(faces: np.ndarray, before: PosedBody, begun: np.ndarray, posed: PosedBody, pos: np.ndarray) -> tuple[str, ...]:
     """Openings that hold other limbs at ``pos`` than where they began, in words."""
     least = _LEAST_LENGTH * float(np.ptp(posed.surface, axis=0).max())
     told = []

@@ -110,7 +110,9 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
     own = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(middle, welded, np.concatenate(tables), corners, own, np.concatenate(places), seam, marks, pattern.height)
+    return PatternSheet(
+        middle, welded, np.concatenate(tables), corners, own, np.concatenate(places), seam, marks, pattern.height
+    )
 
 
 def carried(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
