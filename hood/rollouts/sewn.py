@@ -27,7 +27,7 @@ _COARSE_STRAIN = 0.6
 STILL = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
 _LOOSE, _UNDER = 0.04, 5e-3
-#: An opening of less than this length [body heights] is a slit; one that is less plane than this share of its size has no
+#: An opening of less than this length [body heights] is a slit; one that is drawn less plane than this share of its size has no
 #: part of the body of its own: the front of an open jacket.
 _LEAST_LENGTH, _PLANE = 0.07, 0.35
 
@@ -194,7 +194,7 @@ def _swapped(faces: np.ndarray, before: PosedBody, begun: np.ndarray, posed: Pos
     told = []
     for loop in boundary_loops(faces):
         rim = pos[loop]
-        spread = np.linalg.svd(rim - rim.mean(axis=0), compute_uv=False)
+        spread = np.linalg.svd(begun[loop] - begun[loop].mean(axis=0), compute_uv=False)
         if rim_length(pos, loop) < least or spread[2] > _PLANE * spread[1]:
             continue
         made, holds = limbs_in(begun[loop], before), limbs_in(rim, posed)
