@@ -155,7 +155,8 @@ def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     joints, parents = joints_of(posed), posed.body.parents
     after = np.roll(rim, -1, axis=0)
     middle = rim.mean(axis=0)
-    found, near = set(), set()
+    found: set[str] = set()
+    near: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
         limb = _limb(joint)
         if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
