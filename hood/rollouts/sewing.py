@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.sewn import Sewn, joints_of, judged
+from hood.rollouts.sewn import Sewn, joints_of, judged, limbs_in
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
@@ -39,10 +40,10 @@ if TYPE_CHECKING:
     from hood.assets.material import Material
     from hood.assets.pattern.pattern import Pattern
 
-#: The thin body has this share of the way from its bones to its skin, and its skin grows by so much [m] a step at most.
-_THIN, _GROWTH = 0.15, 0.012
-#: In another attempt they are so.
-_THINNER, _SLOWER = 0.05, 0.006
+#: The thin body has one of these shares of the way from its bones to its skin, and grows by so much [m] a step at most.
+_GIRTHS, _GROWTH = (0.15, 0.3, 0.45, 0.6), 0.012
+#: In the last attempt it grows by so much [m], within a coarse mesh of so many vertices.
+_SLOWER, _FINER = 0.006, 1600
 #: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body.
 _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
 #: A step in which a vertex goes farther than twice this [m] is taken again with half the time; steps grow while none does.
@@ -56,6 +57,8 @@ _CLOSED = 2e-3
 #: At rest the vertices move by less than this [m/s] in the mean, without weight by less than the second.
 _REST, _NEARLY = 1e-3, 5e-3
 _ROUGH, _FINE = NewtonSettings(target_rg=0.1, max_iterations=15), NewtonSettings(target_rg=1e-2)
+#: Cloth that still passes through the body at rest is held so far off [m], one after the other.
+_HELD_OFF = (3e-3, 4e-3, 6e-3)
 #: Cloth at rest that passes through itself is smoothed there once in so many steps.
 _PAUSE = 8
 #: The coarse mesh has about so many vertices, with edges from the second to the third [m].
@@ -64,6 +67,9 @@ _COARSE, _LEAST_EDGE, _MOST_EDGE = 700, 0.022, 0.05
 _WAIST = 0.72
 #: Arms of the poses of the T and the A, degrees below the former.
 _TPOSE, _APOSE = 0.0, 45.0
+#: Legs of a body that puts on trousers end so far apart, degrees each, or else the second: between thighs that touch there is
+#: no room for two seams.
+_APART = (5.0, 10.0)
 #: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
 _BESIDE, _HIGH = 0.19, 0.9
 #: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
@@ -74,28 +80,38 @@ _FLOOR, _SQUARE = 1.2, 0.1
 
 @dataclass(frozen=True)
 class Start:
-    """Where a pattern begins around a body: moved up and forward [m], with the share of the body's girth that it has then."""
+    """Where a pattern begins around a body: moved up and forward [m], with the share of the body's girth that it has then.
 
+    Args:
+        before: the body as the pattern has it, which becomes ``posed`` as it grows.
+        growth: m, that a vertex of the body moves by at most in a step.
+    """
+
+    before: PosedBody
     posed: PosedBody
     lift: float
     depth: float
-    crossed: int  # triangles through the thin body
-    thin: float = _THIN
+    thin: float
     growth: float = _GROWTH
+
+    def thin_body(self) -> np.ndarray:
+        """(W, 3) m: the skin of the body at the beginning."""
+        bones = _bones(self.before)
+        return np.asarray(bones + self.thin * (self.before.surface - bones))
 
     def placed(self, sheet: PatternSheet) -> np.ndarray:
         """(V, 3) m: the vertices of a pattern; what reaches below the floor is pressed together above it."""
         pos = sheet.pos + [0.0, self.lift, self.depth]
         low = np.minimum(pos[:, 1], _PRESSED)
         pos[:, 1] += _PRESSED * np.exp((low - _PRESSED) / _PRESSED) - low
-        return np.asarray(pos + [0.0, float(self.posed.surface[:, 1].min()), 0.0])
+        return np.asarray(pos + [0.0, float(self.before.surface[:, 1].min()), 0.0])
 
 
 @torch.no_grad()
 def sew(
     pattern: Pattern, sheet: PatternSheet, body: Body, betas: np.ndarray, material: Material, angle: float | None = None
 ) -> tuple[PosedBody, Sewn]:
-    """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and start.
+    """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and girth.
 
     Args:
         angle: of the arms below the T-pose, degrees; None: 45 with sleeves and 0 without, and the other in an attempt.
@@ -107,28 +123,47 @@ def sew(
         []
     """
     began = time.perf_counter()
-    coarse = _coarser(pattern, sheet)
-    angles = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
-    begins = [starts(coarse, posed_body(body, arms_down(one), 0, betas)) for one in angles]
-    ways = [begin[0] for begin in begins] + [replace(begins[0][1], thin=_THINNER, growth=_SLOWER)]
+    coarse = _coarser(pattern, sheet, _COARSE)
+    arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
+    first = starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
+    if _has_legs(coarse, first):
+        ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
+    else:
+        ways = [first, *(starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
+    ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
+        coarse = coarse if way is not ways[-1] else _coarser(pattern, sheet, _FINER)
         rough = sewn = sew_around(coarse, way.posed, material, start=way)
         if coarse is not sheet and rough.figures.in_place:
             sewn = refined(coarse, rough, sheet, way, material)
-        tries.append((way, rough, sewn))
+        tries.append((way, coarse, rough, sewn))
         if not sewn.figures.faults:
             break
-    way, rough, sewn = min(tries, key=lambda one: one[2].figures.rank)
+    way, coarse, rough, sewn = min(tries, key=lambda one: one[3].figures.rank)
     if coarse is not sheet and sewn is rough:
         sewn = refined(coarse, rough, sheet, way, material)
     return way.posed, replace(sewn, seconds=time.perf_counter() - began)
 
 
-def _coarser(pattern: Pattern, sheet: PatternSheet) -> PatternSheet:
-    """A mesh of the pattern with less than half the vertices, where one can be had; else ``sheet`` itself."""
+def _standing(body: Body, betas: np.ndarray, arms: float, legs: float) -> PosedBody:
+    """The body with its arms down from the T-pose and each leg turned outwards, in degrees."""
+    frame = arms_down(arms)
+    poses = frame.poses.copy()
+    poses[:, [1, 2], 2] += np.radians([legs, -legs])
+    return posed_body(body, replace(frame, poses=poses), 0, betas)
+
+
+def _has_legs(sheet: PatternSheet, start: Start) -> bool:
+    """Whether a leg alone is in an opening."""
+    pos = start.placed(sheet)
+    return any(limbs_in(pos[loop], start.before) & {"left leg", "right leg"} for loop in boundary_loops(sheet.faces))
+
+
+def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
+    """A mesh of the pattern of about ``count`` vertices, less than half of those of ``sheet``; else that itself."""
     area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
-    wide = min(max(math.sqrt(area / _COARSE / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
+    wide = min(max(math.sqrt(area / count / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
     while True:
         try:
             coarse = sheet_of(pattern, wide, pattern.name)
@@ -150,19 +185,24 @@ def sleeved(pattern: Pattern) -> bool:
     return False
 
 
-def starts(sheet: PatternSheet, posed: PosedBody) -> list[Start]:
-    """Places of the pattern before and behind a body, that with the fewest triangles through the thin one first."""
-    surface = posed.surface
-    thin = _bones(posed)
-    thin += _THIN * (surface - thin)
+def starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[Start]:
+    """Places of the pattern before and behind a body, that with the fewest triangles through the thin body first; and of its
+    girths the greatest with which there are no more."""
+    surface, bones = posed.surface, _bones(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
-    found = []
-    for depth in _DEPTHS:
-        for lift in _LIFTS:
-            start = Start(posed, lift + higher, depth, 0)
-            crossed = len(crossings(start.placed(sheet), sheet.faces, thin, posed.faces).pairs)
-            found.append((crossed, abs(lift) + abs(depth), replace(start, crossed=crossed)))
-    return [start for _, _, start in sorted(found, key=lambda one: one[:2])]
+    best: list[tuple[int, float, Start]] = []
+    for thin in sorted(girths):
+        body, found = bones + thin * (surface - bones), []
+        for depth in _DEPTHS:
+            for lift in _LIFTS:
+                start = Start(posed, posed, lift + higher, depth, thin)
+                crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
+                found.append((crossed, abs(lift) + abs(depth), start))
+        found.sort(key=lambda one: one[:2])
+        if best and found[0][0] > best[0][0]:
+            break
+        best = found
+    return [start for _, _, start in best]
 
 
 @torch.no_grad()
@@ -179,7 +219,7 @@ def sew_around(
     """
     start = start or starts(sheet, posed)[0]
     work = _Work(sheet, start, material, waist_of(sheet) & ~sheet.gathered if held is None else held)
-    here, drawn = work.draw_together(torch.as_tensor(work.begun), start)
+    here, drawn = work.draw_together(torch.as_tensor(work.begun))
     here, resting, speed = work.rest(here, 1.0 / 60.0)
     return work.sewn(here, drawn + resting, speed)
 
@@ -253,25 +293,25 @@ class _Work:
             self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=flat, made=sheet.made
         )
         posed = start.posed
-        skin, bones, faces = posed.surface, _bones(posed), posed.faces
+        skin, thin, faces = posed.surface, start.thin_body(), posed.faces
         floor = float(skin[:, 1].min())
         if float(sheet.pos[:, 1].min()) + start.lift < _LOW:
             points, squares = _floor(floor)
             faces = np.concatenate([faces, squares + len(skin)])
-            skin, bones = np.concatenate([skin, points]), np.concatenate([bones, points])
-        self.skin, self.bones, self.body_faces = (torch.as_tensor(table) for table in (skin, bones, faces))
+            skin, thin = np.concatenate([skin, points]), np.concatenate([thin, points])
+        self.skin, self.thin, self.body_faces = (torch.as_tensor(table) for table in (skin, thin, faces))
         self.progress = ProgressLines("sewing")
-        self._growth = start.growth / max(float((self.skin - self.bones).norm(dim=1).max()), 1e-9)
+        self._growth = start.growth / max(float((self.skin - self.thin).norm(dim=1).max()), 1e-9)
 
     def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
         """What has come of it."""
         start, at = self.start, pos.numpy()
-        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed)
+        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed, start.before)
         return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
 
     def body(self, share: float, later: float) -> Obstacle:
-        """The body that grows from one share of its way from the bones to another."""
-        now, after = (self.bones + s * (self.skin - self.bones) for s in (share, later))
+        """The body that grows from one share of its way from the thin one to another."""
+        now, after = (self.thin + s * (self.skin - self.thin) for s in (share, later))
         scenes = [torch.zeros(len(table), dtype=torch.int64) for table in (now, self.body_faces)]
         return Obstacle(now, after, now, self.body_faces, *scenes)
 
@@ -289,15 +329,15 @@ class _Work:
     def _crosses(self, pos: Tensor) -> bool:
         return bool(len(self_crossings(pos.numpy(), self.faces)))
 
-    def draw_together(self, pos: Tensor, start: Start) -> tuple[Tensor, int]:
+    def draw_together(self, pos: Tensor) -> tuple[Tensor, int]:
         """The seams closed without weight while the body grows; and the steps that it took."""
         plain = default_potential(friction_coefficient=0.0)
-        potential, share, dt, grown = plain, start.thin, 1e-3, 0
+        potential, share, dt, grown = plain, 0.0, 1e-3, 0
         for count in range(1, _MOST_DRAWN + 1):
             closed = dt > _CLOSED
             later = min(1.0, share + self._growth) if closed else share
             if closed and potential is plain:
-                if share == start.thin:
+                if share == 0.0:
                     pos = self._smoothed(pos, share)
                 if not self._crosses(pos):
                     potential = plain.with_terms(layers=LayerBarrier())
@@ -307,7 +347,7 @@ class _Work:
                 dt *= 0.5
                 continue
             pos, share = now, later
-            self.progress.tell(f"step {count}, the body has {share:.0%} of its girth")
+            self.progress.tell(f"step {count}, the body has grown by {share:.0%}")
             grown += share >= 1.0
             if grown >= _MOST_GROWN or (grown and dt >= _DRAWN and float(moved.mean()) / dt < _NEARLY):
                 break
@@ -336,4 +376,15 @@ class _Work:
                 break
             dt = min(max(dt * min(max(2.0 * _STRIDE / max(float(moved.max()), 1e-9), 0.5), 2.0), 1.0 / 240.0), _LONGEST)
         problem = potential.prepare(self._problem(pos, _LONGEST, body, True))
-        return minimize_held_off(potential, problem, pos, _FINE).pos, count, speed
+        return self._out_of_skin(minimize_held_off(potential, problem, pos, _FINE).pos), count, speed
+
+    def _out_of_skin(self, pos: Tensor) -> Tensor:
+        """The cloth held farther off the body where triangles still pass through each other."""
+        posed, body = self.start.posed, self.body(1.0, 1.0)
+        layers = {} if self._crosses(pos) else {"layers": LayerBarrier()}
+        for distance in _HELD_OFF:
+            if not len(crossings(pos.numpy(), self.faces, posed.surface, posed.faces).pairs):
+                break
+            potential = default_potential(collision_epsilon=distance, contact="strict").with_terms(**layers)
+            pos = minimize(potential, self._problem(pos, _DRAWN, body, True), pos, _FINE)[0]
+        return pos

@@ -27,7 +27,7 @@ _COARSE_STRAIN = 0.6
 STILL = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
 _LOOSE, _UNDER = 0.04, 5e-3
-#: An opening of less than this length [body heights] is a slit; one that is less plane than this share of its size has no
+#: An opening of less than this length [body heights] is a slit; one that is drawn less plane than this share of its size has no
 #: part of the body of its own: the front of an open jacket.
 _LEAST_LENGTH, _PLANE = 0.07, 0.35
 
@@ -110,9 +110,17 @@ class Sewn:
 
 
 def judged(
-    cloth: Cloth, faces: np.ndarray, posed: PosedBody, pos: np.ndarray, begun: np.ndarray, held: np.ndarray, speed: float
+    cloth: Cloth,
+    faces: np.ndarray,
+    posed: PosedBody,
+    pos: np.ndarray,
+    begun: np.ndarray,
+    held: np.ndarray,
+    speed: float,
+    before: PosedBody | None = None,
 ) -> SewnFigures:
-    """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m]; ``held`` (V,) bool."""
+    """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m] on the body ``before``, or on the
+    same; ``held`` (V,) bool."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     start, end = cloth.edges.numpy().T
@@ -128,7 +136,7 @@ def judged(
         speed,
         float(signed_distances(pos[held], posed.surface, posed.faces).mean()) if held.any() else 0.0,
         float(posed.surface[:, 1].min() - pos[:, 1].min()),
-        _swapped(faces, posed, begun, pos),
+        _swapped(faces, before or posed, begun, posed, pos),
     )
 
 
@@ -147,7 +155,8 @@ def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     joints, parents = joints_of(posed), posed.body.parents
     after = np.roll(rim, -1, axis=0)
     middle = rim.mean(axis=0)
-    found, near = set(), set()
+    found: set[str] = set()
+    near: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
         limb = _limb(joint)
         if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
@@ -180,16 +189,16 @@ def _passes(start: np.ndarray, end: np.ndarray, middle: np.ndarray, rim: np.ndar
     return bool(int(hit.sum()) % 2)
 
 
-def _swapped(faces: np.ndarray, posed: PosedBody, begun: np.ndarray, pos: np.ndarray) -> tuple[str, ...]:
+def _swapped(faces: np.ndarray, before: PosedBody, begun: np.ndarray, posed: PosedBody, pos: np.ndarray) -> tuple[str, ...]:
     """Openings that hold other limbs at ``pos`` than where they began, in words."""
     least = _LEAST_LENGTH * float(np.ptp(posed.surface, axis=0).max())
     told = []
     for loop in boundary_loops(faces):
         rim = pos[loop]
-        spread = np.linalg.svd(rim - rim.mean(axis=0), compute_uv=False)
+        spread = np.linalg.svd(begun[loop] - begun[loop].mean(axis=0), compute_uv=False)
         if rim_length(pos, loop) < least or spread[2] > _PLANE * spread[1]:
             continue
-        made, holds = limbs_in(begun[loop], posed), limbs_in(rim, posed)
+        made, holds = limbs_in(begun[loop], before), limbs_in(rim, posed)
         if made and holds and made != holds:
             told.append(f"the {' and the '.join(sorted(holds))}, not the {' and the '.join(sorted(made))}")
     return tuple(told)
