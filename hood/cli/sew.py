@@ -29,7 +29,7 @@ from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.sewing import sew, waist_of
+from hood.rollouts.sewing import sew_pattern, waist_of
 from hood.rollouts.sewn import Sewn
 
 #: Exit code of a garment that is not sewn well.
@@ -66,7 +66,7 @@ def run(arguments: Sequence[str]) -> int:
         prepare_folder(written.parent)
         write_pattern(written, pattern)
         print(f"written: {written}")
-    posed, sewn = sew(pattern, sheet, body, betas, material, angle)
+    posed, sewn = sew_pattern(pattern, sheet, body, betas, material, angle)
     worn = _garment(pattern, sheet, sewn)
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:

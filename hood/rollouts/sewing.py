@@ -20,7 +20,7 @@ from torch import Tensor
 from hood.assets.files.said import ProgressLines
 from hood.assets.garment.binding import posed_body
 from hood.assets.motion.sequence_edit import arms_down
-from hood.assets.pattern.sheet import PatternSheet, carried, sheet_of
+from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput
 from hood.energies.potential import default_potential
@@ -79,7 +79,7 @@ _FLOOR, _SQUARE = 1.2, 0.1
 
 
 @dataclass(frozen=True)
-class Start:
+class SewingStart:
     """Where a pattern begins around a body: moved up and forward [m], with the share of the body's girth that it has then.
 
     Args:
@@ -108,7 +108,7 @@ class Start:
 
 
 @torch.no_grad()
-def sew(
+def sew_pattern(
     pattern: Pattern, sheet: PatternSheet, body: Body, betas: np.ndarray, material: Material, angle: float | None = None
 ) -> tuple[PosedBody, Sewn]:
     """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and girth.
@@ -118,31 +118,31 @@ def sew(
 
     Examples:
         >>> sheet = sheet_of(pattern, 0.012, "shirt")  # doctest: +SKIP
-        >>> posed, sewn = sew(pattern, sheet, body, np.zeros(10), Material())  # doctest: +SKIP
+        >>> posed, sewn = sew_pattern(pattern, sheet, body, np.zeros(10), Material())  # doctest: +SKIP
         >>> sewn.figures.faults  # doctest: +SKIP
         []
     """
     began = time.perf_counter()
     coarse = _coarser(pattern, sheet, _COARSE)
     arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
-    first = starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
+    first = sewing_starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
-        ways = [first, *(starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
+        ways = [first, *(sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
         coarse = coarse if way is not ways[-1] else _coarser(pattern, sheet, _FINER)
         rough = sewn = sew_around(coarse, way.posed, material, start=way)
         if coarse is not sheet and rough.figures.in_place:
-            sewn = refined(coarse, rough, sheet, way, material)
+            sewn = sewn_finer(coarse, rough, sheet, way, material)
         tries.append((way, coarse, rough, sewn))
         if not sewn.figures.faults:
             break
     way, coarse, rough, sewn = min(tries, key=lambda one: one[3].figures.rank)
     if coarse is not sheet and sewn is rough:
-        sewn = refined(coarse, rough, sheet, way, material)
+        sewn = sewn_finer(coarse, rough, sheet, way, material)
     return way.posed, replace(sewn, seconds=time.perf_counter() - began)
 
 
@@ -154,7 +154,7 @@ def _standing(body: Body, betas: np.ndarray, arms: float, legs: float) -> PosedB
     return posed_body(body, replace(frame, poses=poses), 0, betas)
 
 
-def _has_legs(sheet: PatternSheet, start: Start) -> bool:
+def _has_legs(sheet: PatternSheet, start: SewingStart) -> bool:
     """Whether a leg alone is in an opening."""
     pos = start.placed(sheet)
     return any(limbs_in(pos[loop], start.before) & {"left leg", "right leg"} for loop in boundary_loops(sheet.faces))
@@ -185,17 +185,17 @@ def sleeved(pattern: Pattern) -> bool:
     return False
 
 
-def starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[Start]:
+def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[SewingStart]:
     """Places of the pattern before and behind a body, that with the fewest triangles through the thin body first; and of its
     girths the greatest with which there are no more."""
     surface, bones = posed.surface, _bones(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
-    best: list[tuple[int, float, Start]] = []
+    best: list[tuple[int, float, SewingStart]] = []
     for thin in sorted(girths):
         body, found = bones + thin * (surface - bones), []
         for depth in _DEPTHS:
             for lift in _LIFTS:
-                start = Start(posed, posed, lift + higher, depth, thin)
+                start = SewingStart(posed, posed, lift + higher, depth, thin)
                 crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
                 found.append((crossed, abs(lift) + abs(depth), start))
         found.sort(key=lambda one: one[:2])
@@ -207,7 +207,7 @@ def starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIR
 
 @torch.no_grad()
 def sew_around(
-    sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None, start: Start | None = None
+    sheet: PatternSheet, posed: PosedBody, material: Material, held: np.ndarray | None = None, start: SewingStart | None = None
 ) -> Sewn:
     """One mesh of a pattern sewn around a body that stands still, in one attempt.
 
@@ -215,9 +215,9 @@ def sew_around(
         sheet: its floor is at y = 0, its middle at x = z = 0.
         posed: the body.
         held: (V,) bool, vertices that are held while the cloth comes to rest; None: the waist of what is worn below it.
-        start: None: the best of :func:`starts`.
+        start: None: the best of :func:`sewing_starts`.
     """
-    start = start or starts(sheet, posed)[0]
+    start = start or sewing_starts(sheet, posed)[0]
     work = _Work(sheet, start, material, waist_of(sheet) & ~sheet.gathered if held is None else held)
     here, drawn = work.draw_together(torch.as_tensor(work.begun))
     here, resting, speed = work.rest(here, 1.0 / 60.0)
@@ -225,10 +225,10 @@ def sew_around(
 
 
 @torch.no_grad()
-def refined(coarse: PatternSheet, sewn: Sewn, sheet: PatternSheet, start: Start, material: Material) -> Sewn:
+def sewn_finer(coarse: PatternSheet, sewn: Sewn, sheet: PatternSheet, start: SewingStart, material: Material) -> Sewn:
     """A garment that was sewn as the mesh ``coarse`` at rest as the mesh ``sheet`` of the same pattern."""
     work = _Work(sheet, start, material, waist_of(sheet) & ~sheet.gathered)
-    pos = torch.as_tensor(carried(coarse, sewn.pos, sheet))
+    pos = torch.as_tensor(carry_over(coarse, sewn.pos, sheet))
     pos = push_out_of_body(work.cloth, pos, work.body(1.0, 1.0), 2e-3)
     here, resting, speed = work.rest(pos, 1.0 / 30.0)
     return work.sewn(here, sewn.steps + resting, speed)
@@ -284,7 +284,7 @@ def _floor(height: float) -> tuple[np.ndarray, np.ndarray]:
 class _Work:
     """The cloth of a pattern and the body that it is sewn around."""
 
-    def __init__(self, sheet: PatternSheet, start: Start, material: Material, held: np.ndarray) -> None:
+    def __init__(self, sheet: PatternSheet, start: SewingStart, material: Material, held: np.ndarray) -> None:
         self.began = time.perf_counter()
         self.start, self.faces, self.held = start, sheet.faces, held
         self.begun = start.placed(sheet)

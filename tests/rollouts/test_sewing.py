@@ -17,7 +17,7 @@ from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.pattern import read_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.cloth.cloth import build_cloth
-from hood.rollouts.sewing import sew, sew_around, starts, waist_of
+from hood.rollouts.sewing import sew_around, sew_pattern, sewing_starts, waist_of
 from hood.rollouts.sewn import Sewn, SewnFigures, joints_of, judged, limbs_in
 
 
@@ -92,7 +92,7 @@ def test_a_fine_mesh_begins_where_a_coarse_one_rests(tmp_path: Path, body: Body)
     path = write(tmp_path / "skirt.json", PATTERNS["skirt"]())
     pattern = read_pattern(path)
     sheet = sheet_of(pattern, 0.016, str(path))
-    posed, sewn = sew(pattern, sheet, body, np.zeros(10), Material())
+    posed, sewn = sew_pattern(pattern, sheet, body, np.zeros(10), Material())
     assert len(sewn.pos) == len(sheet.pos) > 2 * 700
     assert sewn.figures.faults == []
     assert np.ptp(posed.surface[:, 0]) > 1.4  # the arms are not in the way of a skirt
@@ -117,7 +117,7 @@ def test_a_pattern_moves_with_the_height_of_the_body(tmp_path: Path, body: Body)
     lifts = {}
     for beta in (-2.0, 0.0, 2.0):
         posed = posed_body(body, arms_down(45.0), 0, np.array([beta] + 9 * [0.0]))
-        lifts[float(np.ptp(posed.surface[:, 1]))] = starts(sheet, posed)[0].lift
+        lifts[float(np.ptp(posed.surface[:, 1]))] = sewing_starts(sheet, posed)[0].lift
     assert [lift for _, lift in sorted(lifts.items())] == sorted(lifts.values())
     assert len(set(lifts.values())) == 3
 

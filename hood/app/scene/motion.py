@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import getitem
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,14 +21,16 @@ from hood.app.settings.rollout_settings import Settings, objects
 from hood.assets.body.body import Body, body_part
 from hood.assets.files.library import names
 from hood.assets.garment.garment import Garment
-from hood.assets.material import Material
 from hood.assets.motion.animated_mesh import BodyMesh, body_kind
 from hood.assets.motion.load import HANDS
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.skeleton import TRANSLATION_UNITS
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.motion import BodyMotion, Motion
-from hood.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from hood.assets.material import Material
+    from hood.scene.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     )
 
 
-def carried(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
+def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
     """(V, 3) m: the vertices of ``fine`` on ``coarse``, another mesh of the same pattern, whose vertices are at ``pos`` (W, 3).
 
     On the outline of a panel they keep their side and their share of its length, so that both sides of a stitch agree; inside
