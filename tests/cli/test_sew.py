@@ -104,7 +104,7 @@ def test_panels_stand_in_the_file(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("compiled_layers")
 def test_a_design_is_sewn_and_its_pattern_can_be_sewn_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target, specification = tmp_path / "mini.npz", tmp_path / "patterns" / "mini.json"
-    words = ["edge=0.05", "sheet=none", "betas=[1.0]", f"output={target}"]
+    words = ["edge=0.05", "sheet=none", f"output={target}"]
     assert main(["sew", "design:skirt", "design={length:0.35,flare:0.2}", f"pattern={specification}", *words]) == 0
     assert f"written: {specification}" in capsys.readouterr().out
     first = load_garment(target)
