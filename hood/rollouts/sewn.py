@@ -24,7 +24,7 @@ STRAIN, SUNK = 0.25, 0.15
 #: A coarse mesh is stretched by less than this where a fine one can come to rest.
 _COARSE_STRAIN = 0.6
 #: In the last step the vertices move by no more than this [m/s] in the mean.
-STILL = 2e-3
+REST_SPEED = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
 _LOOSE, _UNDER = 0.04, 5e-3
 #: An opening of less than this length [body heights] is a slit; one that is drawn less plane than this share of its size has no
@@ -72,7 +72,7 @@ class SewnFigures:
             (self.sunk < -SUNK, f"its top has risen by {-1e2 * self.sunk:.0f} cm"),
             (self.loose > _LOOSE, f"its waist stands off the body by {1e2 * self.loose:.0f} cm, it is too wide"),
             (self.under > _UNDER, f"it reaches {1e2 * self.under:.0f} cm below the floor"),
-            (not self.speed <= STILL, f"it still moves by {1e3 * self.speed:.1f} mm a second"),
+            (not self.speed <= REST_SPEED, f"it still moves by {1e3 * self.speed:.1f} mm a second"),
         )
         return [text for bad, text in limits if bad]
 
