@@ -71,7 +71,7 @@ def run(arguments: Sequence[str]) -> int:
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:
         prepare_folder(picture.parent)
-        save_png(picture, _sheet(worn, sheet, posed))
+        save_png(picture, _sheet(worn, sheet, posed, str(config.material)))
         print(f"written: {picture}")
     faults = sewn.figures.faults
     if faults:
@@ -185,8 +185,8 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
     return lines
 
 
-def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody) -> np.ndarray:
-    """The pattern, and the garment from front, side and back."""
+def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody, fabric: str) -> np.ndarray:
+    """The pattern, and the garment of a fabric from front, side and back: a picture (H, W, 3) uint8."""
     still = RolloutData(
         worn.rest_pos[None],
         worn.faces,
@@ -195,7 +195,7 @@ def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody) -> np.ndarray:
         posed.faces,
         np.zeros(1),
         {},
-        {"garment": worn.name},
+        {"garment": worn.name, "fabric_names": fabric},
     )
     views = [Film(still, _WIDTH, _HEIGHT, azimuth_deg=azimuth).frame(0) for azimuth in (0.0, 90.0, 180.0)]
     return contact_sheet([_drawn(sheet), *views], 4, ["pattern", "front", "side", "back"])

@@ -40,8 +40,9 @@ def test_a_skirt_from_its_pattern_to_a_rollout(tmp_path: Path, capsys: pytest.Ca
     edges = torch.as_tensor(unique_edges(garment.faces))
     lengths = edge_lengths(flat, torch.as_tensor(garment.faces), edges)
     assert float((scene.cloth.rest_length.double() / lengths - 1.0).abs().max()) < 1e-3
-    frames = list(hood.simulate(load_garment(target), "plie", num_frames=4))
-    assert max(frame.metrics["strain_p99"] for frame in frames) < 0.25
+    for worn, most in ((garment, 0.1), (load_garment(target), 0.25)):  # elastic is stretched where it is worn
+        frames = list(hood.simulate(worn, "plie", num_frames=4))
+        assert max(frame.metrics["strain_p99"] for frame in frames) < most
 
 
 @pytest.mark.usefixtures("compiled_layers")
@@ -114,7 +115,7 @@ def test_a_design_is_sewn_and_its_pattern_can_be_sewn_again(tmp_path: Path, caps
     assert again.flat is not None
     assert (len(again.rest_pos), len(again.faces)) == (len(first.rest_pos), len(first.faces))
     areas = [np.abs(np.linalg.det(one.flat[:, 1:] - one.flat[:, :1])).sum() for one in (first, again)]
-    assert areas[1] == pytest.approx(areas[0], rel=1e-3)
+    assert areas[1] == pytest.approx(areas[0], rel=1e-6)
 
 
 def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None:

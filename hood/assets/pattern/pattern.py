@@ -341,10 +341,17 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     Edges stand in the order of the loop; an existing file is replaced at once or not at all.
 
     Raises:
-        ValueError: an edge whose curve has more than two control points, which the format has not.
+        ValueError: an edge whose curve has more than two control points, which the format has not; what the key ``hood`` says,
+            which is read and not written.
     """
     panels = {}
+    if any(stitch.angle is not None or stitch.bending != 1.0 for stitch in pattern.stitches):
+        raise ValueError(f"{path}: angles and stiffness of seams are not written; write the stitches' key hood into the file")
     for name, panel in pattern.panels.items():
+        if panel.elastic != (1.0, 1.0) or panel.folds or any(edge.making != EdgeMaking() for edge in panel.edges):
+            raise ValueError(
+                f"{path}: panel {name!r}: elastic, folds and hems are not written; write its key hood into the file"
+            )
         edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of turns for which several triples of angles stand

@@ -13,7 +13,7 @@ from sewing_patterns import PATTERNS, panel, skirt, specification, write
 
 from hood.assets.material import Material
 from hood.assets.pattern.making import with_elastic
-from hood.assets.pattern.pattern import Edge, read_pattern
+from hood.assets.pattern.pattern import Edge, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.mesh import topology
@@ -279,3 +279,15 @@ def test_a_fold_keeps_its_side_where_its_panel_is_turned_over(tmp_path: Path) ->
 def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         _sheet(tmp_path, _made(**hood))
+
+
+@pytest.mark.parametrize("place", ["panel", "edge", "stitch"])
+def test_what_is_not_written_is_refused(place: str, tmp_path: Path) -> None:
+    content = skirt()
+    own = content["pattern"]["panels"]["front"]
+    table = {"panel": own, "edge": own["edges"][0], "stitch": content["pattern"]["stitches"][0][0]}[place]
+    table["hood"] = {"panel": {"elastic": 0.9}, "edge": {"bending": 3}, "stitch": {"angle": 90}}[place]
+    pattern = read_pattern(write(tmp_path / "skirt.json", content))
+    with pytest.raises(ValueError, match="not written"):
+        write_pattern(tmp_path / "again.json", pattern)
+    assert not (tmp_path / "again.json").exists()
