@@ -9,10 +9,10 @@ import numpy as np
 from omegaconf import DictConfig
 
 from hood.app.common import prepare_folder, require_package, split_words
-from hood.app.scene.fabrics import fabric_named
+from hood.app.scene.fabrics import most_alike
 from hood.app.scene.garments import shape_coefficients
 from hood.app.scene.placing import AUTO, arm_angle
-from hood.app.settings.compose import ConfigError, options, plain, shown
+from hood.app.settings.compose import ConfigError, build, plain, shown
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
 from hood.assets.files.library import unknown
@@ -54,9 +54,7 @@ def run(arguments: Sequence[str]) -> int:
     gathers, angle = _number(config, "gathers", 1.0, 100.0), arm_angle(config.pose)
     if angle is None and str(config.pose) != AUTO:
         raise ConfigError(f"pose={shown(config.pose)}: give tpose, apose, degrees of the arms below the T-pose, or auto")
-    if str(config.material) not in options("material"):
-        raise ConfigError(unknown("fabric", str(config.material), options("material")))
-    material = fabric_named(str(config.material))
+    material: Material = build(config.material)
     pattern, body, betas = _pattern(word, config, gathers)
     target = _target(config, pattern)
     picture, written, factor = _picture(config, target), _specification(config), _waist(config)
@@ -71,7 +69,7 @@ def run(arguments: Sequence[str]) -> int:
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:
         prepare_folder(picture.parent)
-        save_png(picture, _sheet(worn, sheet, posed, str(config.material)))
+        save_png(picture, _sheet(worn, sheet, posed, most_alike(plain(config.material))))
         print(f"written: {picture}")
     faults = sewn.figures.faults
     if faults:

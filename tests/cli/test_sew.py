@@ -23,7 +23,7 @@ from hood.mesh.topology import unique_edges
 def test_a_skirt_from_its_pattern_to_a_rollout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("PIL")
     path, target = write(tmp_path / "skirt.json", skirt()), tmp_path / "out" / "skirt.npz"
-    assert main(["sew", str(path), "edge=0.05", f"output={target}"]) == 0
+    assert main(["sew", str(path), "edge=0.05", "material=wool_suiting", f"output={target}"]) == 0
     text = capsys.readouterr().out
     assert "2 panels, 2 stitches" in text
     assert "waist=held holds a waist instead" in text
@@ -68,7 +68,8 @@ def test_what_is_not_sewn_well_is_kept_for_a_look(tmp_path: Path, capsys: pytest
         (["skirt.json", "pose=run"], "pose=run: give tpose, apose"),
         (["skirt.json", "output=a.obj"], "output=a.obj: garments are .npz files"),
         (["skirt.json", "sheet=a.jpg"], "sheet=a.jpg: sheets are .png files"),
-        (["skirt.json", "material=steel"], "steel"),
+        (["skirt.json", "material=steel"], "unknown material 'steel'"),
+        (["skirt.json", "material.density=-1"], "density"),
         (["broken.json"], "not JSON"),
         (["design:tshrt"], "unknown design 'tshrt': did you mean 'tshirt'"),
         (["design:"], "unknown design '': known are tank"),

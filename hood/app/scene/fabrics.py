@@ -42,7 +42,7 @@ def fabric_of(config: Settings, garment: Garment, motion: Motion) -> Material:
 def fabric_names(config: Settings, garment: Garment, motion: Motion) -> tuple[list[str], np.ndarray]:
     """What the fabrics of a garment are called: options of ``material=``, the most alike where some of their values were
     changed, empty where none is alike; and (V,) which of them most faces of a vertex are of."""
-    names, number = [_most_alike(plain(config.material))], np.zeros(len(garment.faces), dtype=np.int64)
+    names, number = [most_alike(plain(config.material))], np.zeros(len(garment.faces), dtype=np.int64)
     body = motion.body if isinstance(motion, BodyMotion) else None
     for part, given in (plain(config.fabrics) or {}).items():
         name = str(given if isinstance(given, str) else given.get("material", names[0]))
@@ -53,7 +53,9 @@ def fabric_names(config: Settings, garment: Garment, motion: Motion) -> tuple[li
     return names, votes.argmax(axis=1)
 
 
-def _most_alike(material: Mapping[str, Any]) -> str:
+def most_alike(material: Mapping[str, Any]) -> str:
+    """The option of ``material=`` that a fabric's values in a config are, or are most like; empty where none is alike."""
+
     def alike(name: str) -> int:
         return sum(material.get(key) == value for key, value in _values(name).items())
 
