@@ -22,6 +22,7 @@ MEANINGS = {
     "strap": "where the shoulder ends, as a share of its length",
     "shape": "of the neckline",
     "collar": "of the neckline",
+    "front": "what closes the front: buttons, a zip, or nothing, as it is one piece",
     "fit": "1: the side seams follow the waist; 0: they are straight",
     "flare": "what the hem is wider than the hips, as a share",
     "gathers": "length of a gathered edge over that of the one which it is sewn to",

@@ -11,16 +11,15 @@ from hood.assets.pattern.blocks import (
     Table,
     bodice,
     both_halves,
-    draw_strip,
     legs,
     skirt,
     sleeves,
     tiers,
     torso,
-    trunk_place,
     upper_half,
 )
 from hood.assets.pattern.bottoms import gore_waist, gores, leg_waist
+from hood.assets.pattern.fronts import open_front, stand, turned_collar
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.options import Choices, Design, Options, entered
 
@@ -67,19 +66,6 @@ def _tshirt(t: Table, m: Measures, o: Options) -> None:
     _sleeved(t, m, o)
 
 
-def _collar(t: Table, m: Measures, height: float) -> None:
-    """A stand of two strips on the neckline."""
-    for back in (False, True):
-        name = "back" if back else "front"
-        below = t.keys(name, "neck")
-        lengths = t.lengths(below)
-        angles, at = trunk_place(m, back)
-        shift = (at[0], at[1], m.shoulder[2] + (-0.1 if back else 0.1))
-        draw_strip(t, f"collar_{name}", lengths, lengths, height, m.neck_height, (angles, shift))
-        t.sew_all(below, t.keys(f"collar_{name}", "below"))
-    t.sew_keys("collar_front", "collar_back", ["side"])
-
-
 @entered(
     TOPS,
     ease=(0.14, 0.05, 0.5),
@@ -95,7 +81,29 @@ def _shirt(t: Table, m: Measures, o: Options) -> None:
     torso(t, m, o.ease, o.length, Neck(o.depth, 0.04), o.fit)
     sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff if o.cuff >= 0.02 else 0.0)
     if o.collar == "stand":
-        _collar(t, m, 0.035)
+        stand(t, m, 0.035)
+
+
+@entered(
+    TOPS,
+    ease=(0.12, 0.05, 0.5),
+    length=(0.26, 0.1, 0.6),
+    sleeve=(0.97, 0.4, 1.0),
+    wide=(1.15, 0.8, 1.8),
+    cuff=(0.06, 0.0, 0.1),
+    collar=("turned", "stand", "none"),
+    front=("buttons", "zip", "closed"),
+    depth=(0.2, 0.12, 0.3),
+    fit=(0.4, 0.0, 1.0),
+)
+def _blouse(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.04), o.fit)
+    sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff if o.cuff >= 0.02 else 0.0)
+    if o.collar == "stand":
+        stand(t, m, 0.035)
+    elif o.collar == "turned":
+        turned_collar(t, m, 0.03, 0.045, 0.07)
+    open_front(t, o.front, *(["collar_front"] if o.collar != "none" else []), "front")
 
 
 @entered(
