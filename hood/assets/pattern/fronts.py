@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from hood.assets.pattern.blocks import XY, Place, Side, Table, both_halves, draw_strip, trunk_place
-from hood.assets.pattern.making import EdgeMaking, Fastener
+from hood.assets.pattern.making import EdgeMaking, Fastener, Fold
 from hood.assets.pattern.measures import Measures
-from hood.assets.pattern.pattern import Edge, PatternPanel, Stitch
+from hood.assets.pattern.pattern import Edge, Stitch
 from hood.assets.pattern.sheet import PatternSheet, in_triangles
 from hood.mesh import geometry, topology
 from hood.mesh.flat import SIDE_TABLES, Construction
@@ -34,6 +34,8 @@ _OVER, _DOWN, _AROUND = 4.5e-3, 0.03, 0.1
 #: The fold of a turned collar [rad], and how stiff its interfacing makes it.
 _TURNED, _INTERFACED = math.radians(155.0), EdgeMaking(bending=4.0, width=0.12)
 _CREASED = 30.0
+#: The angle of a seam of quilting [rad], and the shortest one [m]; points of a side that tell where it ends.
+_QUILTED, _SHORTEST_LINE, _FINE = math.radians(110.0), 0.05, 512
 #: A fall is by this share longer at its outer edge; it is placed so far [m] outside of its stand, and begins so far [m] from the
 #: middle of the front.
 _SPREAD, _OUTSIDE, _FROM_MIDDLE = 0.3, 0.015, 0.012
@@ -140,10 +142,27 @@ def turned_collar(t: Table, m: Measures, height: float, fall: float, point: floa
 
 
 def ribbed(t: Table, factor: float, *names: str) -> None:
-    """Panels of ribbing, at rest ``factor`` times as long along x as they are cut."""
+    """Panels of ribbing, at rest ``factor`` times as long along x as they are cut, but never longer."""
     for name in names:
-        panel: PatternPanel = t.panels[name]
-        t.panels[name] = replace(panel, elastic=(factor, 1.0))
+        t.panels[name] = replace(t.panels[name], elastic=(min(float(factor), 1.0), 1.0))
+
+
+def quilted(t: Table, height: float, *names: str) -> None:
+    """Panels with level seams so far [m] from each other, at one height in all of them, which stand in: the cloth between two
+    is a tube."""
+    low = min(float(edge.start[1]) for name in names for edge in t.panels[name].edges)
+    for name in names:
+        panel, folds = t.panels[name], []
+        outline = np.concatenate([edge.evenly(_FINE)[:-1] for edge in panel.edges])
+        after = np.roll(outline, -1, axis=0)
+        for level in np.arange(low + height, outline[:, 1].max(), height):
+            through = (outline[:, 1] < level) != (after[:, 1] < level)
+            share = (level - outline[through, 1]) / (after[through, 1] - outline[through, 1])
+            ends = np.sort(outline[through, 0] + share * (after[through, 0] - outline[through, 0]))
+            for left, right in zip(ends[::2], ends[1::2], strict=True):
+                if right - left > _SHORTEST_LINE:
+                    folds.append(Fold(np.array([left, level]), np.array([right, level]), -_QUILTED, _CREASED))
+        t.panels[name] = replace(panel, folds=tuple(folds))
 
 
 def opened(sheet: PatternSheet, worn: np.ndarray) -> tuple[PatternSheet, np.ndarray, np.ndarray]:

@@ -29,6 +29,8 @@ MEANINGS = {
     "tiers": "number of gathered rows",
     "circle": "share of a circle that the skirt is cut from",
     "band": "height of the waistband [m]",
+    "rib": "length of the ribbing of band and cuffs over that of the body in it",
+    "tube": "height of the tubes that quilting makes [m]",
     "rise": "of the upper edge over the waist [m]",
     "knee": "what the leg is wider than the knee, as a share",
     "hem": "width of the leg at its hem, as a share of that above it",

@@ -251,13 +251,23 @@ def _divisions(
         least[first] = least[second] = 2 if first[0] == second[0] else 1
     found = {}
     for key, shares in at.items():
-        steps = np.unique(np.round(sorted(shares), 9))
+        steps = _apart(shares, _AT_CORNER * edge / lengths[key])
         parts = np.maximum(
             np.round(np.diff(steps) * lengths[key] / edge).astype(np.int64), least[key] if len(steps) == 2 else 1
         )
         inner = [np.linspace(low, high, n + 1)[:-1] for low, high, n in zip(steps[:-1], steps[1:], parts, strict=True)]
         found[key] = np.append(np.concatenate(inner), 1.0)
     return found
+
+
+def _apart(shares: set[float], least: float) -> np.ndarray:
+    """Shares of a side in their order; those nearer to each other than ``least`` are one, as ends of folds on both sides of a
+    stitch are."""
+    steps = np.unique(np.round(sorted(shares), 9))
+    group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
+    middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]
+    middle[0], middle[-1] = 0.0, 1.0
+    return np.asarray(middle)
 
 
 def _meshed(
