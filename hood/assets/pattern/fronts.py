@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from hood.assets.pattern.blocks import XY, Place, Side, Table, both_halves, draw_strip, trunk_place
+from hood.assets.pattern.blocks import XY, Place, Side, SideKey, Table, both_halves, draw_strip, trunk_place
 from hood.assets.pattern.making import EdgeMaking, Fastener, Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import Edge, Stitch
@@ -34,6 +35,8 @@ _OVER, _DOWN, _AROUND = 4.5e-3, 0.03, 0.1
 #: The fold of a turned collar [rad], and how stiff its interfacing makes it.
 _TURNED, _INTERFACED = math.radians(155.0), EdgeMaking(bending=4.0, width=0.12)
 _CREASED = 30.0
+#: A gorge begins so far [m] from the shoulder on the neckline; what is on either side of the neck at lapels.
+_GORGE, _TURNED_PARTS = 0.06, ("lapel", "stand", "fall")
 #: The angle of a seam of quilting [rad], and the shortest one [m]; points of a side that tell where it ends.
 _QUILTED, _SHORTEST_LINE, _FINE = math.radians(110.0), 0.05, 512
 #: A fall is by this share longer at its outer edge; it is placed so far [m] outside of its stand, and begins so far [m] from the
@@ -41,13 +44,14 @@ _QUILTED, _SHORTEST_LINE, _FINE = math.radians(110.0), 0.05, 512
 _SPREAD, _OUTSIDE, _FROM_MIDDLE = 0.3, 0.015, 0.012
 
 
-def open_front(t: Table, front: str, *names: str) -> None:
-    """Panels across the middle as two, ``left_`` and ``right_``, closed there by ``front`` ("buttons", "zip"), from the first
-    panel on down."""
+def open_front(t: Table, front: str, *names: str, every: float | None = None) -> None:
+    """Panels across the middle as two, ``left_`` and ``right_``, closed there by ``front`` ("buttons", "zip"), with buttons
+    ``every`` so many metres."""
     if front == "closed":
         return
+    fastener = CLOSED[front] if every is None else replace(CLOSED[front], every=every)
     for name in names:
-        _divide(t, name, CLOSED[front], _PLACKETS[front])
+        _divide(t, name, fastener, _PLACKETS[front])
 
 
 def _divide(t: Table, name: str, fastener: Fastener, placket: EdgeMaking) -> None:
@@ -63,10 +67,7 @@ def _divide(t: Table, name: str, fastener: Fastener, placket: EdgeMaking) -> Non
         t.panels[other] = replace(panel, name=other, edges=edges, numbers=tuple(range(len(edges))))
         t.sides[other] = [*(keys[k] for k in own), f"{side}_opening"]
         moved |= {(name, k): (other, place) for place, k in enumerate(own)}
-    t.stitches = [
-        replace(stitch, first=moved.get(stitch.first, stitch.first), second=moved.get(stitch.second, stitch.second))
-        for stitch in t.stitches
-    ]
+    t.stitches = [_moved(stitch, moved) for stitch in t.stitches]
     both = [(other, len(t.sides[other]) - 1) for other in (f"left_{name}", f"right_{name}")]
     t.stitches.append(Stitch(both[0], both[1], fastener=fastener))
 
@@ -131,20 +132,106 @@ def turned_collar(t: Table, m: Measures, height: float, fall: float, point: floa
         [("right_fall", "fold"), ("left_fall", "fold"), *t.keys("fall_back", "fold")],
         strict=True,
     )
-    for upper, fold in folds:
-        t.sew(upper, fold, same=True)
-        t.stitches[-1] = replace(t.stitches[-1], angle=-_TURNED, bending=_CREASED)
+    _turn_down(t, list(folds))
     for side in ("left", "right"):
         t.sew((f"{side}_fall", "side"), ("fall_back", f"{side}_side"))
-    for name in ("collar_front", "collar_back", "left_fall", "right_fall", "fall_back"):
-        panel = t.panels[name]
-        t.panels[name] = replace(panel, edges=tuple(replace(edge, making=_INTERFACED) for edge in panel.edges))
+    _interface(t, "collar_front", "collar_back", "left_fall", "right_fall", "fall_back")
 
 
 def ribbed(t: Table, factor: float, *names: str) -> None:
     """Panels of ribbing, at rest ``factor`` times as long along x as they are cut, but never longer."""
     for name in names:
         t.panels[name] = replace(t.panels[name], elastic=(min(float(factor), 1.0), 1.0))
+
+
+def lapels(t: Table, m: Measures, wide: float, fall: float) -> None:
+    """Lapels of that width [m] at a neckline that is a V, a collar with a fall of ``fall`` [m], and a notch between the two."""
+    height = 0.03
+    back = t.keys("back", "neck")
+    own = t.lengths(back)
+    draw_strip(t, "collar_back", own, own, height, m.neck_height + fall, _beside_neck(m, True))
+    t.sew_all(back, t.keys("collar_back", "below"))
+    fold, outer = _rings(own[1], fall, m.neck_height + fall + height)
+    half = [Side("outer", outer.start, outer.curve), Side("side", outer.end), Side("fold", fold.end, fold.curve[::-1])]
+    t.draw("fall_back", both_halves(half, fold.start, True), *_beside_neck(m, True, 0.1 + _OUTSIDE))
+    neck = t.panels["front"].edges[t.sides["front"].index("left_neck")]
+    _cut_neck(t, _GORGE / neck.length)
+    _draw_lapel(t, m, neck.start, neck.end, (wide, fall, height))
+    folds = [(("collar_back", f"above{k}"), other) for k, other in enumerate(t.keys("fall_back", "fold"))]
+    for side in ("left", "right"):
+        t.sew((f"{side}_stand", "below"), ("front", f"{side}_neck_upper"))
+        t.sew((f"{side}_stand", "side"), ("collar_back", f"{side}_side"))
+        t.sew((f"{side}_lapel", "gorge"), (f"{side}_fall", "gorge"))
+        t.sew((f"{side}_fall", "side"), ("fall_back", f"{side}_side"))
+        folds += [((f"{side}_stand", "above"), (f"{side}_fall", "fold"))]
+        folds += [(("front", f"{side}_neck_lower"), (f"{side}_lapel", "roll"))]
+    _turn_down(t, folds)
+    _interface(t, "collar_back", "fall_back", *(f"{side}_{part}" for side in ("left", "right") for part in _TURNED_PARTS))
+
+
+def _draw_lapel(t: Table, m: Measures, top: np.ndarray, low: np.ndarray, size: tuple[float, float, float]) -> None:
+    """Lapel, stand and fall on the neckline of the left front from ``top`` to ``low`` (2,), and their mirror images; ``size`` is
+    the width of the lapel, that of the fall, and the height of the stand [m]."""
+    wide, fall, height = size
+    down = (low - top) / np.linalg.norm(low - top)
+    out = np.array([-down[1], down[0]])  # away from the middle
+    begin = top + _GORGE * down
+    notch, tip = begin + 0.55 * wide * out, begin + wide * out - 0.01 * down
+    bend = low + 0.45 * (tip - low) + 0.025 * out
+    angles, at = trunk_place(m, False)
+    flat, over = (angles, at), (angles, (at[0], at[1], at[2] + _OUTSIDE))
+    lapel = [Side("outer", _xy(low), (_xy(bend),)), Side("tip", _xy(tip)), Side("gorge", _xy(notch)), Side("roll", _xy(begin))]
+    t.draw("left_lapel", lapel, *over)
+    t.draw("left_stand", [Side("below", _xy(begin)), Side("side", _xy(top)), Side("above", _xy(top - height * out))], *flat)
+    upper = begin - math.hypot(_GORGE, height) * down
+    side, end = upper + fall * _turned_by(out, 0.35), notch + 0.6 * fall * _turned_by(-down, -0.45)
+    sides = [Side("gorge", _xy(begin)), Side("end", _xy(notch)), Side("outer", _xy(end)), Side("side", _xy(side))]
+    t.draw("left_fall", [*sides, Side("fold", _xy(upper))], *over)
+    for part in _TURNED_PARTS:
+        t.mirror(f"left_{part}", f"right_{part}")
+
+
+def _turned_by(way: np.ndarray, angle: float) -> np.ndarray:
+    """A direction (2,) turned counter-clockwise by an angle [rad]."""
+    return np.array([way[0] * math.cos(angle) - way[1] * math.sin(angle), way[0] * math.sin(angle) + way[1] * math.cos(angle)])
+
+
+def _xy(point: np.ndarray) -> XY:
+    return float(point[0]), float(point[1])
+
+
+def _cut_neck(t: Table, share: float) -> None:
+    """The straight necklines of the front in two at a share of them from the shoulder, ``neck_upper`` and ``neck_lower``."""
+    for side in ("left", "right"):
+        panel, keys = t.panels["front"], t.sides["front"]
+        place = keys.index(f"{side}_neck")
+        own = panel.edges[place]
+        middle = own.at(np.array([share if side == "left" else 1.0 - share]))[0]
+        parts = replace(own, end=middle), replace(own, start=middle)
+        names = [f"{side}_neck_upper", f"{side}_neck_lower"][:: 1 if side == "left" else -1]
+        edges = (*panel.edges[:place], *parts, *panel.edges[place + 1 :])
+        t.panels["front"] = replace(panel, edges=edges, numbers=tuple(range(len(edges))))
+        t.sides["front"] = [*keys[:place], *names, *keys[place + 1 :]]
+        moved = {("front", k): ("front", k + 1) for k in range(place + 1, len(keys))}
+        t.stitches = [_moved(stitch, moved) for stitch in t.stitches]
+
+
+def _moved(stitch: Stitch, moved: Mapping[tuple[str, int], tuple[str, int]]) -> Stitch:
+    """A stitch of sides that have other places now."""
+    return replace(stitch, first=moved.get(stitch.first, stitch.first), second=moved.get(stitch.second, stitch.second))
+
+
+def _turn_down(t: Table, folds: Sequence[tuple[SideKey, SideKey]]) -> None:
+    """Sides that stand and those that are turned down from them, sewn with a fold."""
+    for standing, turned in folds:
+        t.sew(standing, turned, same=True)
+        t.stitches[-1] = replace(t.stitches[-1], angle=-_TURNED, bending=_CREASED)
+
+
+def _interface(t: Table, *names: str) -> None:
+    for name in names:
+        panel = t.panels[name]
+        t.panels[name] = replace(panel, edges=tuple(replace(edge, making=_INTERFACED) for edge in panel.edges))
 
 
 def quilted(t: Table, height: float, *names: str) -> None:

@@ -23,6 +23,7 @@ MEANINGS = {
     "shape": "of the neckline",
     "collar": "of the neckline",
     "front": "what closes the front: buttons, a zip, or nothing, as it is one piece",
+    "lapel": "width of the lapels [m]",
     "fit": "1: the side seams follow the waist; 0: they are straight",
     "flare": "what the hem is wider than the hips, as a share",
     "gathers": "length of a gathered edge over that of the one which it is sewn to",

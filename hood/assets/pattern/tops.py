@@ -23,7 +23,7 @@ from hood.assets.pattern.blocks import (
     upper_half,
 )
 from hood.assets.pattern.bottoms import gore_waist, gores, leg_waist
-from hood.assets.pattern.fronts import open_front, quilted, ribbed, stand, turned_collar
+from hood.assets.pattern.fronts import lapels, open_front, quilted, ribbed, stand, turned_collar
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.options import Choices, Design, Options, entered
 
@@ -154,6 +154,24 @@ def _gilet(t: Table, m: Measures, o: Options) -> None:
     stand(t, m, 0.055)
     open_front(t, o.front, "collar_front", "front")
     quilted(t, o.tube, *(name for name in t.panels if "collar" not in name))
+
+
+@entered(
+    TOPS,
+    ease=(0.18, 0.1, 0.5),
+    length=(0.3, 0.12, 0.7),
+    sleeve=(0.97, 0.6, 1.0),
+    wide=(1.05, 0.9, 1.4),
+    lapel=(0.085, 0.06, 0.11),
+    front=("buttons", "closed"),
+    depth=(0.8, 0.55, 0.95),
+    fit=(0.4, 0.0, 1.0),
+)
+def _blazer(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.06, 1.0, "v"), o.fit)
+    sleeves(t, m, o.ease, o.sleeve, o.wide)
+    lapels(t, m, o.lapel, 0.045)
+    open_front(t, o.front, "front", every=0.1)
 
 
 @entered(
