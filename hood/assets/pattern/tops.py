@@ -143,7 +143,7 @@ def _bomber(t: Table, m: Measures, o: Options) -> None:
 @entered(
     TOPS,
     ease=(0.25, 0.12, 0.5),
-    length=(0.15, 0.05, 0.4),
+    length=(0.22, 0.08, 0.4),
     tube=(0.08, 0.06, 0.2),
     strap=(0.95, 0.8, 1.0),
     front=("zip", "buttons", "closed"),
