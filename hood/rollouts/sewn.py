@@ -118,14 +118,16 @@ def judged(
     held: np.ndarray,
     speed: float,
     before: PosedBody | None = None,
+    closed: np.ndarray | None = None,
 ) -> SewnFigures:
     """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m] on the body ``before``, or on the
-    same; ``held`` (V,) bool."""
+    same; ``held`` (V,) bool. Openings are those of the faces ``closed`` (G, 3), if not of all."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     start, end = cloth.edges.numpy().T
     strain = np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / cloth.rest_length.numpy() - 1.0)
-    openings = find_openings(pos, faces, posed.surface, posed.faces)
+    closed = faces if closed is None else closed
+    openings = find_openings(pos, closed, posed.surface, posed.faces)
     return SewnFigures(
         len(crossings(pos, faces, posed.surface, posed.faces).pairs),
         len(self_crossings(pos, faces)),
@@ -136,7 +138,7 @@ def judged(
         speed,
         float(signed_distances(pos[held], posed.surface, posed.faces).mean()) if held.any() else 0.0,
         float(posed.surface[:, 1].min() - pos[:, 1].min()),
-        _swapped(faces, before or posed, begun, posed, pos),
+        _swapped(closed, before or posed, begun, posed, pos),
     )
 
 

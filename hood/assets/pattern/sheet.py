@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.making import construction_of
+from hood.assets.pattern.making import Fastener, construction_of
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
 from hood.mesh.flat import Construction
@@ -23,6 +23,8 @@ _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 _MARGIN = 0.02
 #: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
 _CURVED, _AT_ONCE = 32, 1 << 21
+#: No pairs.
+_NONE = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,10 @@ class PatternSheet:
         height: m, of the body around which the panels are placed.
         made: its elastic, its folds and how stiff its seams and hems are.
         stiffness: (V,) how many times as stiff as the fabric the cloth is; None: once.
+        joins: (J, 2) points of ``uv`` that seams join.
+        fastened: seams that are to be opened: what closes them, and their points (N, 2) of ``uv``.
+        rows: of an opened sheet, (P, 2) vertices by name that close it; ``rims`` (N, 2) are all that face each other there, and
+            ``closed`` (G, 3) faces as if each of these were one.
     """
 
     pos: np.ndarray
@@ -54,6 +60,11 @@ class PatternSheet:
     height: float = BODY_HEIGHT
     made: Construction = Construction()
     stiffness: np.ndarray | None = None
+    joins: np.ndarray = field(default_factory=lambda: _NONE)
+    fastened: tuple[tuple[Fastener, np.ndarray], ...] = ()
+    rows: Mapping[str, np.ndarray] = field(default_factory=dict)
+    rims: np.ndarray = field(default_factory=lambda: _NONE)
+    closed: np.ndarray | None = None
 
     @property
     def flat(self) -> np.ndarray:
@@ -111,11 +122,16 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         owner.append(np.full(len(triangles), number))
         start += len(points)
     pos, corners, of_panel = np.concatenate(placed), np.concatenate(faces), np.concatenate(owner)
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    pairs, fastened = [_NONE], []
     for stitch in pattern.stitches:
         first, second = outlines[stitch.first], outlines[stitch.second]
-        pairs.append(np.stack([first, second if stitch.same else second[::-1]], axis=1))
-    joined = np.concatenate(pairs)
+        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
+        if stitch.fastener is None:
+            pairs.append(pair)
+        else:
+            fastened.append((stitch.fastener, pair))
+    joins = np.concatenate(pairs)
+    joined = np.concatenate([joins, *(pair for _, pair in fastened)])
     label = topology.connected_components(start, joined)
     _, welds = np.unique(label, return_inverse=True)
     count = np.bincount(welds)
@@ -133,9 +149,10 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
     parts = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(
+    sewn = PatternSheet(
         middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
     )
+    return replace(sewn, joins=joins, fastened=tuple(fastened))
 
 
 def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
@@ -164,7 +181,7 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
             distance, nearest = cKDTree(fine.uv[rim]).query(fine.uv[inner])
             reach = np.sqrt(np.abs(np.linalg.det(coarse.uv[own][:, 1:] - coarse.uv[own][:, :1])).mean())
             share = np.clip(1.0 - distance / reach, 0.0, 1.0)
-            face, bary = _in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
+            face, bary = in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
             found[~on_rim] = np.einsum("nk,nkx->nx", bary, at[own[face]])
         np.add.at(total, welds[rows], found)
         np.add.at(count, welds[rows], 1.0)
@@ -176,7 +193,7 @@ def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarra
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
 
 
-def _in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
@@ -234,13 +251,23 @@ def _divisions(
         least[first] = least[second] = 2 if first[0] == second[0] else 1
     found = {}
     for key, shares in at.items():
-        steps = np.unique(np.round(sorted(shares), 9))
+        steps = _apart(shares, _AT_CORNER * edge / lengths[key])
         parts = np.maximum(
             np.round(np.diff(steps) * lengths[key] / edge).astype(np.int64), least[key] if len(steps) == 2 else 1
         )
         inner = [np.linspace(low, high, n + 1)[:-1] for low, high, n in zip(steps[:-1], steps[1:], parts, strict=True)]
         found[key] = np.append(np.concatenate(inner), 1.0)
     return found
+
+
+def _apart(shares: set[float], least: float) -> np.ndarray:
+    """Shares of a side in their order; those nearer to each other than ``least`` are one, as ends of folds on both sides of a
+    stitch are."""
+    steps = np.unique(np.round(sorted(shares), 9))
+    group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
+    middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]
+    middle[0], middle[-1] = 0.0, 1.0
+    return np.asarray(middle)
 
 
 def _meshed(
