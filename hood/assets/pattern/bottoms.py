@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hood.assets.pattern.blocks import XY, Leg, Side, SideKey, Table, band, draw_strip, legs, skirt, tiers, trunk_place
+from hood.assets.pattern.making import Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.options import Choices, Design, Options, entered
 
 #: Every design here by name.
 BOTTOMS: dict[str, Design] = {}
+#: The quarters of a skirt, and where they are around the body [degrees].
+_AROUND = {"back_right": -135.0, "front_right": -45.0, "front_left": 45.0, "back_left": 135.0}
+#: Pleats are folded by so much [rad] at rest, and stiffer there by this factor.
+_LAID, _CREASE = math.radians(165.0), 5.0
 
 
 def gores(t: Table, ring: float, circle: float, length: float, top: XY, least: float = 0.0) -> None:
@@ -39,8 +45,8 @@ def gores(t: Table, ring: float, circle: float, length: float, top: XY, least: f
         Side("waist1", *arc(inner, 0.0, -half)),
         Side("behind", arc(inner, -half, 0.0)[0]),
     ]
-    names = ["gore_back_right", "gore_front_right", "gore_front_left", "gore_back_left"]
-    for name, around in zip(names, (-135.0, -45.0, 45.0, 135.0), strict=True):
+    names = [f"gore_{name}" for name in _AROUND]
+    for name, around in zip(names, _AROUND.values(), strict=True):
         angles = (-max(tilt, least), around, 0.0)
         out = np.array([math.sin(math.radians(around)), 0.0, math.cos(math.radians(around))])
         waist = Rotation.from_euler("xyz", angles, degrees=True).apply([0.0, -inner, 0.0])
@@ -112,6 +118,64 @@ def _gathered(t: Table, m: Measures, o: Options) -> None:
 @entered(BOTTOMS, length=(0.6, 0.3, 0.95), gathers=(1.4, 1.35, 1.7), tiers=(3.0, 2.0, 4.0), band=(0.035, 0.03, 0.08))
 def _tiered(t: Table, m: Measures, o: Options) -> None:
     _rows(t, m, o.length, round(o.tiers), o.gathers, o.band)
+
+
+def _pleated_outline(m: Measures, o: Options) -> tuple[list[Side], tuple[Fold, ...], float]:
+    """A quarter of a pleated skirt, a sector below (0, 0) whose folds run from the waist to the hem; half its width at the hem
+    with the pleats laid [m].
+
+    Every pleat hides a flap. The upper edges of a flap are sewn to each other; the visible pieces between are the waist.
+    """
+    long, count, box = o.length * m.waist_height, round(0.25 * o.pleats), o.pleat == "box"
+    waist = 1.02 * m.waist * 0.25 / count
+    # What is seen grows evenly from the waist to the hem, over the hips.
+    hem = waist + ((1.0 + o.ease) * m.hips * 0.25 / count - waist) * long / (m.waist_height - m.hip_height)
+    # Mountains are beyond 0. The seams are at the edges of flaps of knife pleats, and in the middle of those of box pleats.
+    unit = {"waist": _LAID, "1dart_a": -_LAID, "1dart_b": 0.0}
+    unit = {"2dart_a": -_LAID, "2dart_b": _LAID, **unit} if box else unit
+    keys = [key for _ in range(count) for key in unit]
+    deep = o.under * waist * (0.5 if box else 1.0)
+    steps = [np.cumsum([0.0, *(wide if key == "waist" else deep for key in keys)]) for wide in (waist, hem)]
+    turn = max((steps[1][-1] - steps[0][-1]) / long, 0.01)
+    inner = float(steps[0][-1]) / turn
+    # Where the fold of a flap begins, its edge is cut deeper, as a dart is.
+    notches = np.array([deep if key.endswith("dart_b") else 0.0 for key in [*keys, ""]])
+    angles = [turn * (way / way[-1] - 0.5) for way in steps]
+    above, below = (
+        list(zip((radius * np.sin(angle)).tolist(), (inner - radius * np.cos(angle)).tolist(), strict=True))
+        for radius, angle in zip((inner + notches, np.full(len(notches), inner + long)), angles, strict=True)
+    )
+    names = [f"waist{k}" if key == "waist" else f"{k // len(unit)}_{key}" for k, key in enumerate(keys)]
+    sides = [*(Side(f"hem{k}", point) for k, point in enumerate(below[:-1])), Side("ahead", below[-1])]
+    sides += [Side(key, point) for key, point in zip(names[::-1], above[:0:-1], strict=True)]
+    lines = zip(above[1:-1], below[1:-1], list(unit.values()) * count, strict=False)
+    folds = tuple(Fold(np.array(start), np.array(end), angle, _CREASE) for start, end, angle in lines if angle)
+    return [*sides, Side("behind", above[0])], folds, 0.5 * hem * count
+
+
+@entered(
+    BOTTOMS,
+    ease=(0.05, 0.02, 0.3),
+    length=(0.45, 0.25, 0.8),
+    pleats=(16.0, 8.0, 24.0),
+    pleat=("knife", "box"),
+    under=(0.8, 0.7, 0.95),
+    band=(0.035, 0.03, 0.08),
+)
+def _pleated(t: Table, m: Measures, o: Options) -> None:
+    outline, folds, half = _pleated_outline(m, o)
+    off, middle = 1.02 * m.waist / (2.0 * math.pi) + 0.02, 0.5 * (m.front + m.back)
+    tilt = math.degrees(math.asin(min(max((half + 0.01 - off) / (o.length * m.waist_height), 0.0), 0.9)))
+    for name, around in _AROUND.items():
+        x, z = math.sin(math.radians(around)), math.cos(math.radians(around))
+        t.draw(f"skirt_{name}", outline, (-tilt, around, 0.0), (off * x, m.waist_height, middle + off * z))
+        t.panels[f"skirt_{name}"] = replace(t.panels[f"skirt_{name}"], folds=folds)
+    names = [f"skirt_{name}" for name in _AROUND]
+    for name, other in zip(names, names[1:] + names[:1], strict=True):
+        t.sew((name, "ahead"), (other, "behind"))
+    halves = {False: names[1:3], True: [names[3], names[0]]}
+    edges = {back: [side for name in own for side in t.keys(name, "waist")] for back, own in halves.items()}
+    band(t, m, edges, o.band, m.waist_height + o.band)
 
 
 def _trousers_with_band(t: Table, m: Measures, o: Options, knee: float, hem: float) -> None:

@@ -13,12 +13,13 @@ file, angles in degrees; other programs pass it over:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from hood.mesh import topology
 from hood.mesh.flat import Construction, stretched_sides
@@ -196,6 +197,35 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
             elastic[band.inside] = stretched_sides(flat[:, 1:] - flat[:, :1], band.way, factor)[band.inside]
     drawn = replace(sheet, made=replace(sheet.made, elastic=elastic))
     return replace(drawn, stiffness=np.where(drawn.gathered, stiffness, 1.0))
+
+
+def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not meet; without, flat.
+
+    Args:
+        outer: 1, or -1 for a panel whose outer side is at negative z.
+    """
+    flat = np.pad(points, ((0, 0), (0, 1)))
+    if len(folds) < 2:
+        return flat
+    ways = [fold.end - fold.start for fold in folds]
+    ways = [way / np.linalg.norm(way) * np.sign(way @ ways[0]) for way in ways]
+    across = [np.array([way[1], -way[0]]) for way in ways]
+    beyond = np.stack([(points - fold.start) @ side for fold, side in zip(folds, across, strict=True)], axis=1) > 0.0
+    order = np.argsort([fold.start @ across[0] for fold in folds])
+    laid, turn, shift = flat.copy(), np.eye(3), np.zeros(3)
+    for row in order:
+        # What lies beyond a fold turns around it, with all folds before.
+        own, start = (
+            Rotation.from_rotvec(outer * folds[row].angle * np.append(ways[row], 0.0)),
+            np.append(folds[row].start, 0.0),
+        )
+        shift = turn @ (start - own.apply(start)) + shift
+        turn = turn @ own.as_matrix()
+        laid[beyond[:, row]] = flat[beyond[:, row]] @ turn.T + shift
+    middles = flat.mean(axis=0), laid.mean(axis=0)
+    back = Rotation.align_vectors(flat - middles[0], laid - middles[1])[0]
+    return np.asarray(back.apply(laid - middles[1]) + middles[0])
 
 
 def sides_between(faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -156,6 +156,8 @@ SHEEN, FUZZ = 0.06, 0.10
 _SUPERSAMPLING = 2
 #: Share of its colour that a face seen from inside shows.
 _INSIDE = 0.62
+#: A face whose normal has less than this [cosine] in common with the mean at a vertex is beyond a fold there.
+_CREASE = 0.5
 
 
 @dataclass(frozen=True)
@@ -272,8 +274,12 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
             raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
         behind = np.full(len(pos), mesh.behind)
         shine = np.broadcast_to(np.asarray(mesh.shine, dtype=np.float64), pos.shape)
-        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind, shine))
-        offset += len(pos)
+        normal = _vertex_normals(pos, faces)
+        faces, carrier, own = _creased(pos, faces, normal)
+        rows = [values[carrier] for values in (pos, linear, normal, hem, behind, shine)]
+        rows[2][len(pos) :] = own
+        parts.append((rows[0], faces + offset, *rows[1:]))  # type: ignore[arg-type]
+        offset += len(carrier)
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -381,6 +387,30 @@ def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
         sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
     ]
     return unit(np.stack(total, axis=1))
+
+
+def _creased(pos: _Array, faces: NDArray[np.int64], normal: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64], _Array]:
+    """Faces with their own vertices where the mean normal (V, 3) of a vertex is not theirs, as in a pleat; the vertex (V + N,)
+    that each stands for, and the normals (N, 3) of the new ones."""
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    flat = unit(np.cross(b - a, c - a))
+    off = np.einsum("fx,fkx->fk", flat, normal[faces]) < _CREASE
+    off &= np.abs(flat).sum(axis=1, keepdims=True) > 0.5
+    own = np.argwhere(off)
+    if not len(own):
+        return faces, np.arange(len(pos)), np.zeros((0, 3))
+    vertex = faces[off]
+    order = np.argsort(faces, axis=None, kind="stable")
+    ends = np.searchsorted(faces.reshape(-1)[order], [vertex, vertex + 1])
+    count = ends[1] - ends[0]
+    row = np.repeat(np.arange(len(own)), count)
+    around = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - ends[0], count)] // 3
+    # Of the faces around the vertex those on this side of the fold share its normal.
+    alike = (flat[around] * flat[own[row, 0]]).sum(axis=1) > 0.5
+    total = np.stack([np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)], axis=1)
+    faces = faces.copy()
+    faces[off] = len(pos) + np.arange(len(own))
+    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(total)
 
 
 def _blend(weights: _Array, values: _Array, corners: NDArray[np.int64]) -> _Array:

@@ -19,7 +19,7 @@ from hood.mesh import topology
 #: Openings of every design without sleeves; sleeves change none of them.
 OPENINGS = {
     **dict.fromkeys(("tank", "tshirt", "shirt", "bodice", "sheath", "dress", "swing", "shift"), 4),
-    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "poncho", "cape"), 2),
+    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "poncho", "cape"), 2),
     **dict.fromkeys(("trousers", "leggings", "shorts"), 3),
     "hoodie": 4,
     "jumpsuit": 5,
@@ -107,7 +107,7 @@ def test_a_written_design_is_read_back(name: str, bodies: list[Measures], tmp_pa
 
 def test_a_waistband_is_as_long_as_the_waist(bodies: list[Measures]) -> None:
     for measures in bodies:
-        for name in ("skirt", "pencil", "circle", "gathered", "tiered"):
+        for name in ("skirt", "pencil", "circle", "gathered", "tiered", "pleated"):
             pattern = draft(name, measures)
             rim = [edge.length for panel in pattern.panels.values() for edge in panel.edges if panel.name.startswith("band")]
             top = [
