@@ -34,6 +34,8 @@ ELASTIC, _STIFF, _HEM = (0.2, 2.0), (0.01, 1000.0), 0.02
 _ALLOWANCE = 0.01
 #: A fold is at least so long [m].
 _SHORTEST = 1e-4
+#: What a panel says of what rides on it, which :mod:`hood.assets.pattern.riding` reads.
+_RIDING = ("patches", "buttons", "radius")
 #: Points of a side that tell how much of it is in a band, and points of an edge of the line that the band follows.
 _SAMPLES = 9
 #: Lengths within this share are one: lines are points here.
@@ -67,7 +69,7 @@ def panel_making(where: str, own: Mapping[str, Any], scale: float) -> tuple[tupl
     Raises:
         ValueError: what cannot be so; names ``where``, the key, the value and the repair. So do the next two.
     """
-    made = _made(where, own, ("elastic", "folds"))
+    made = _made(where, own, ("elastic", "folds", *_RIDING))
     both = made.get("elastic", [1.0, 1.0])
     both = both if isinstance(both, list) else [both, 1.0]
     if len(both) != 2:

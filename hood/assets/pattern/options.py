@@ -33,6 +33,7 @@ MEANINGS = {
     "band": "height of the waistband [m]",
     "rise": "of the upper edge over the waist [m]",
     "knee": "what the leg is wider than the knee, as a share",
+    "turn": "height of what is turned up at the hems [m]; below 0.02 nothing is",
     "hem": "width of the leg at its hem, as a share of that above it",
 }
 Choices = tuple[float, float, float] | tuple[str, ...]

@@ -167,7 +167,7 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
             distance, nearest = cKDTree(fine.uv[rim]).query(fine.uv[inner])
             reach = np.sqrt(np.abs(np.linalg.det(coarse.uv[own][:, 1:] - coarse.uv[own][:, :1])).mean())
             share = np.clip(1.0 - distance / reach, 0.0, 1.0)
-            face, bary = _in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
+            face, bary = in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
             found[~on_rim] = np.einsum("nk,nkx->nx", bary, at[own[face]])
         np.add.at(total, welds[rows], found)
         np.add.at(count, welds[rows], 1.0)
@@ -179,7 +179,7 @@ def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarra
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
 
 
-def _in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
@@ -265,7 +265,7 @@ def _meshed(
     triangles = np.zeros((0, 3), dtype=np.int64)
     if len(outline) >= 3:
         triangles = Delaunay(points).simplices.astype(np.int64)
-        triangles = triangles[_inside(points[triangles].mean(axis=1), outline)]
+        triangles = triangles[inside(points[triangles].mean(axis=1), outline)]
         corners = points[triangles]
         area = np.linalg.det(corners[:, 1:] - corners[:, :1])
         triangles = triangles[np.abs(area) > 1e-6 * edge * edge]
@@ -311,7 +311,7 @@ def _creased(
         tips = []
         for place, end in zip(places, (fold.start, fold.end), strict=True):
             if place is None:
-                if not _inside(end[None], outline)[0]:
+                if not inside(end[None], outline)[0]:
                     x, y = 1e2 * end
                     raise ValueError(
                         f"{where}: panel {panel.name!r}: the end ({x:.1f}, {y:.1f}) cm of a fold is outside; move it"
@@ -359,7 +359,7 @@ def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
     columns = np.arange(low[0] + 0.25 * edge, high[0], edge)
     x = columns[None] + 0.5 * edge * (np.arange(len(rows))[:, None] % 2)
     points = np.stack([x, np.broadcast_to(rows[:, None], x.shape)], axis=-1).reshape(-1, 2)
-    points = points[_inside(points, outline)] if len(points) else points
+    points = points[inside(points, outline)] if len(points) else points
     if not len(points):
         return np.zeros((0, 2))
     nearest, _ = cKDTree(_dense(outline, edge)).query(points)
@@ -374,7 +374,7 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
 
 
-def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
     (x, y), following = outline.T, np.roll(outline, -1, axis=0)
     u, v = following.T

@@ -38,7 +38,7 @@ from hood.media.renderer.raster import (
     unit,
 )
 from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
-from hood.mesh.topology import counted_edges
+from hood.mesh.topology import connected_components, counted_edges
 
 _Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ _SEAM_AT, _SEAM_HALF_WIDTH, _SEAM_SHADE = 0.02, 0.0015, 0.35
 def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     """Distance [m] of every vertex from the next open edge of its surface, (V,); :data:`FAR` where none is near.
 
-    Near is what is near along the surface: a sleeve beside the waist is not.
+    Near is what is near along the surface: a sleeve beside the waist is not, nor a pocket upon a hem.
 
     Args:
         pos: (V, 3) [m], at rest.
@@ -71,10 +71,11 @@ def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     graph = coo_matrix((np.maximum(length, 1e-9), (edges[:, 0], edges[:, 1])), shape=2 * (len(points),))
     along = dijkstra(graph, directed=False, indices=np.unique(open_edges), min_only=True, limit=_REACH)
     share = np.linspace(0.0, 1.0, _SAMPLES)[:, None, None]
-    start, end = points[open_edges[:, 0]], points[open_edges[:, 1]]
-    dist, _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points)
-    near = np.isfinite(along)
-    result[near] = dist[near]
+    near, part = np.isfinite(along), connected_components(len(points), edges)
+    for own in np.unique(part[open_edges[:, 0]]):
+        start, end = points[open_edges[part[open_edges[:, 0]] == own].T]
+        rows = near & (part == own)
+        result[rows], _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points[rows])
     return result
 
 

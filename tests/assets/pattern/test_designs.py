@@ -20,7 +20,7 @@ from hood.mesh import topology
 OPENINGS = {
     **dict.fromkeys(("tank", "tshirt", "shirt", "bodice", "sheath", "dress", "swing", "shift"), 4),
     **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "poncho", "cape"), 2),
-    **dict.fromkeys(("trousers", "leggings", "shorts"), 3),
+    **dict.fromkeys(("trousers", "leggings", "shorts", "jeans"), 3),
     "hoodie": 4,
     "jumpsuit": 5,
 }
@@ -129,7 +129,9 @@ def test_a_cap_is_as_long_as_its_armhole_and_a_little(bodies: list[Measures]) ->
 
 def lengths(name: str, measures: Measures, options: dict[str, Any]) -> list[float]:
     panels = draft(name, measures, options).panels.values()
-    return [round(edge.length, 6) for panel in panels for edge in panel.edges]
+    found = [edge.length for panel in panels for edge in panel.edges]
+    found += [value for panel in panels for patch in panel.patches for value in patch.outline.reshape(-1)]
+    return [round(float(value), 6) for value in found]
 
 
 @pytest.mark.parametrize("name", DESIGNS)
