@@ -165,8 +165,8 @@ def _has_legs(sheet: PatternSheet, start: SewingStart) -> bool:
 
 
 def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
-    """A mesh of the pattern of about ``count`` vertices, less than half of those of ``sheet`` or, of the last attempt, more than
-    those; else that itself."""
+    """A mesh of the pattern of about ``count`` vertices: less than half of those of ``sheet`` or, in the last attempt, more;
+    else that itself."""
     area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
     wide = min(max(math.sqrt(area / count / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
     while True:

@@ -102,7 +102,12 @@ def write_rounded(path: Path, garment: Garment) -> None:
             kind = np.float32 if step == _POSITION else np.float16
             arrays[key] = (np.round(arrays[key] / step) * step).astype(kind)
     for key, value in arrays.items():
-        if isinstance(value, np.ndarray) and value.dtype == np.int64 and value.min(initial=0) >= 0 and value.max(initial=0) < 2**16:
+        if (
+            isinstance(value, np.ndarray)
+            and value.dtype == np.int64
+            and value.min(initial=0) >= 0
+            and value.max(initial=0) < 2**16
+        ):
             arrays[key] = value.astype(np.uint16)
         elif key in ("uv", "rider_pos"):
             arrays[key] = value.astype(np.float32)

@@ -33,7 +33,9 @@ def test_lengths_are_the_patterns(name: str) -> None:
     garment = load_garment(name)
     ending = name.partition("_")[2]
     assert abs(len(garment.rest_pos) / SIZES[f"_{ending}" if ending else ""] - 1.0) < 0.15
-    assert garment.flat is not None and garment.uv is not None and garment.bound
+    assert garment.bound
+    assert garment.flat is not None
+    assert garment.uv is not None
     np.testing.assert_array_equal(garment.flat, garment.uv[garment.uv_faces])
     # Worn on the body that it was made for, it is hardly stretched.
     edges = unique_edges(garment.faces)
