@@ -23,12 +23,14 @@ from hood.assets.pattern.designs import DESIGNS, draft
 from hood.assets.pattern.making import ELASTIC, with_elastic
 from hood.assets.pattern.measures import measure_body
 from hood.assets.pattern.pattern import Pattern, read_pattern, write_pattern
+from hood.assets.pattern.riding import riders_of
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.media.exports.sequences import write_obj
 from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.frames import ridden_faces, ridden_rest
 from hood.rollouts.sewing import sew_pattern, sewn_open, waist_of
 from hood.rollouts.sewn import Sewn
 
@@ -165,6 +167,7 @@ def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:
         flat=sheet.flat,
         stiffness=sheet.stiffness,
         fasteners=dict(sheet.rows) or None,
+        riders=riders_of(pattern, sheet, sewn.pos),
         **vars(sheet.made),
     )
 
@@ -188,10 +191,11 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
 
 def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody, fabric: str) -> np.ndarray:
     """The pattern, and the garment of a fabric from front, side and back: a picture (H, W, 3) uint8."""
+    shown = ridden_rest(worn.rest_pos, worn)
     still = RolloutData(
-        worn.rest_pos[None],
-        worn.faces,
-        worn.rest_pos,
+        shown[None],
+        ridden_faces(worn.faces, len(worn.rest_pos), worn.riders),
+        shown,
         posed.surface[None],
         posed.faces,
         np.zeros(1),

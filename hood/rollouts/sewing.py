@@ -165,7 +165,8 @@ def _has_legs(sheet: PatternSheet, start: SewingStart) -> bool:
 
 
 def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
-    """A mesh of the pattern of about ``count`` vertices, less than half of those of ``sheet``; else that itself."""
+    """A mesh of the pattern of about ``count`` vertices: less than half of those of ``sheet`` or, in the last attempt, more;
+    else that itself."""
     area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
     wide = min(max(math.sqrt(area / count / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
     while True:
@@ -174,8 +175,9 @@ def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
         except ValueError:  # a panel is too narrow for such edges
             coarse = None
         if coarse is not None:
-            return coarse if 2 * len(coarse.pos) < len(sheet.pos) else sheet
-        if area / wide**2 > len(sheet.pos):
+            another = 2 * len(coarse.pos) < len(sheet.pos) or (count == _FINER and len(coarse.pos) > len(sheet.pos))
+            return coarse if another else sheet
+        if area / wide**2 > max(len(sheet.pos), count):
             return sheet
         wide *= 0.8
 

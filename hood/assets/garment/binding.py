@@ -112,8 +112,10 @@ def bind_posed(garment: Garment, posed: PosedBody, worn_pos: np.ndarray | None =
     straight = np.allclose(turn, np.eye(3), atol=1e-9)
     as_given = straight and np.array_equal(worn_pos, garment.rest_pos)
     mean = garment.rest_pos - np.einsum("vij,vj->vi", turn, offset)
+    riders = garment.riders
     return replace(
         garment,
+        riders=None if riders is None else replace(riders, pos=riders.positions(mean, garment.rest_pos)),
         rest_pos=mean,
         flat=None if garment.flat is None else followed(garment.flat, garment.faces, garment.rest_pos, mean),
         skin_pos=None if as_given else grown - offset,

@@ -124,7 +124,11 @@ def turned_collar(t: Table, m: Measures, height: float, fall: float, point: floa
     low = (_FROM_MIDDLE + 0.01, top - point)
     way = np.array(outer.end) - outer.curve[1]
     bend = np.array(outer.end) - 0.5 * way * np.linalg.norm(np.array(outer.end) - low) / np.linalg.norm(way)
-    half = [Side("outer", low, ((float(bend[0]), float(bend[1])),)), Side("side", outer.end), Side("fold", fold.end, fold.curve[::-1])]
+    half = [
+        Side("outer", low, ((float(bend[0]), float(bend[1])),)),
+        Side("side", outer.end),
+        Side("fold", fold.end, fold.curve[::-1]),
+    ]
     t.draw("left_fall", [*half, Side("end", fold.start)], *_beside_neck(m, False, far))
     t.mirror("left_fall", "right_fall")
     folds = zip(
@@ -379,7 +383,9 @@ def _with_underlaps(
         uv_faces.append(first + own)
         faces.append(table.reshape(-1)[own])
         name = f"{fastener.row}_underlap{len(uv) - 1}"
-        panels[name] = np.concatenate([np.zeros(sum(len(one) for one in faces[:-1]), dtype=bool), np.ones(len(own), dtype=bool)])
+        panels[name] = np.concatenate(
+            [np.zeros(sum(len(one) for one in faces[:-1]), dtype=bool), np.ones(len(own), dtype=bool)]
+        )
     total = sum(len(one) for one in faces)
     panels = {name: np.pad(own, (0, total - len(own))) for name, own in panels.items()}
     more, tips = total - len(cut.faces), len(numbers)

@@ -15,12 +15,13 @@ file, angles in degrees; other programs pass it over:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from hood.mesh import topology
 from hood.mesh.flat import Construction, stretched_sides
@@ -35,6 +36,8 @@ ELASTIC, _STIFF, _HEM = (0.2, 2.0), (0.01, 1000.0), 0.02
 _ALLOWANCE = 0.01
 #: A fold is at least so long [m]; what is said of a fastener, and its least [m].
 _SHORTEST, _OF_FASTENER, _NEAREST = 1e-4, ("every", "overlap"), 5e-3
+#: What a panel says of what rides on it, which :mod:`hood.assets.pattern.riding` reads.
+_RIDING = ("patches", "buttons", "radius")
 #: Points of a side that tell how much of it is in a band, and points of an edge of the line that the band follows.
 _SAMPLES = 9
 #: Lengths within this share are one: lines are points here.
@@ -78,7 +81,7 @@ def panel_making(where: str, own: Mapping[str, Any], scale: float) -> tuple[tupl
     Raises:
         ValueError: what cannot be so; names ``where``, the key, the value and the repair. So do the next two.
     """
-    made = _made(where, own, ("elastic", "folds"))
+    made = _made(where, own, ("elastic", "folds", *_RIDING))
     both = made.get("elastic", [1.0, 1.0])
     both = both if isinstance(both, list) else [both, 1.0]
     if len(both) != 2:
@@ -254,6 +257,35 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
             elastic[band.inside] = stretched_sides(flat[:, 1:] - flat[:, :1], band.way, factor)[band.inside]
     drawn = replace(sheet, made=replace(sheet.made, elastic=elastic))
     return replace(drawn, stiffness=np.where(drawn.gathered, stiffness, 1.0))
+
+
+def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not meet; without, flat.
+
+    Args:
+        outer: 1, or -1 for a panel whose outer side is at negative z.
+    """
+    flat = np.pad(points, ((0, 0), (0, 1)))
+    if len(folds) < 2:
+        return flat
+    ways = [fold.end - fold.start for fold in folds]
+    ways = [way / np.linalg.norm(way) * np.sign(way @ ways[0]) for way in ways]
+    across = [np.array([way[1], -way[0]]) for way in ways]
+    beyond = np.stack([(points - fold.start) @ side for fold, side in zip(folds, across, strict=True)], axis=1) > 0.0
+    order = np.argsort([fold.start @ across[0] for fold in folds])
+    laid, turn, shift = flat.copy(), np.eye(3), np.zeros(3)
+    for row in order:
+        # What lies beyond a fold turns around it, with all folds before.
+        own, start = (
+            Rotation.from_rotvec(outer * folds[row].angle * np.append(ways[row], 0.0)),
+            np.append(folds[row].start, 0.0),
+        )
+        shift = turn @ (start - own.apply(start)) + shift
+        turn = turn @ own.as_matrix()
+        laid[beyond[:, row]] = flat[beyond[:, row]] @ turn.T + shift
+    middles = flat.mean(axis=0), laid.mean(axis=0)
+    back = Rotation.align_vectors(flat - middles[0], laid - middles[1])[0]
+    return np.asarray(back.apply(laid - middles[1]) + middles[0])
 
 
 def sides_between(faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:

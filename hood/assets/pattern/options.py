@@ -28,12 +28,16 @@ MEANINGS = {
     "flare": "what the hem is wider than the hips, as a share",
     "gathers": "length of a gathered edge over that of the one which it is sewn to",
     "tiers": "number of gathered rows",
+    "pleats": "number of pleats all around; an odd one is rounded",
+    "pleat": "what the pleats are: knife, all to one side, or box, to both sides in turn",
+    "under": "what each pleat hides, as a share of the most that lies flat under it",
     "circle": "share of a circle that the skirt is cut from",
     "band": "height of the waistband [m]",
     "rib": "length of the ribbing of band and cuffs over that of the body in it",
     "tube": "height of the tubes that quilting makes [m]",
     "rise": "of the upper edge over the waist [m]",
     "knee": "what the leg is wider than the knee, as a share",
+    "turn": "height of what is turned up at the hems [m]; below 0.02 nothing is",
     "hem": "width of the leg at its hem, as a share of that above it",
 }
 Choices = tuple[float, float, float] | tuple[str, ...]

@@ -32,6 +32,7 @@ from hood.assets.pattern.making import (
     written_panel,
     written_stitch,
 )
+from hood.assets.pattern.riding import Patch, patches_of, written_patches
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
 MOST_GATHERED = 4.0
@@ -113,6 +114,7 @@ class PatternPanel:
         rotation: (3, 3).
         translation: (3,) m.
         elastic: how many times as long it is at rest as it is cut, along x and along y.
+        patches: pockets, buttons and the like, which ride on it.
     """
 
     name: str
@@ -123,6 +125,7 @@ class PatternPanel:
     label: str = ""
     elastic: tuple[float, float] = (1.0, 1.0)
     folds: tuple[Fold, ...] = ()
+    patches: tuple[Patch, ...] = ()
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) m in space of points (N, 2) of the panel."""
@@ -234,7 +237,8 @@ def _panel(where: str, name: str, own: Any, scale: float) -> PatternPanel:
     turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     translation = scale * _numbers(f"{where}: translation", own.get("translation", [0, 0, 0]), (3,))
     elastic, folds = panel_making(where, own, scale)
-    return PatternPanel(name, tuple(edges), tuple(numbers), turn, translation, str(own.get("label", "")), elastic, folds)
+    patches, label = patches_of(where, own.get("hood", {}), scale), str(own.get("label", ""))
+    return PatternPanel(name, tuple(edges), tuple(numbers), turn, translation, label, elastic, folds, patches)
 
 
 def _loop(where: str, ends: list[tuple[int, int]]) -> list[int]:
@@ -354,7 +358,7 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     Raises:
         ValueError: an edge whose curve has more than two control points, which the format has not.
     """
-    panels = {}
+    panels: dict[str, dict[str, Any]] = {}
     for name, panel in pattern.panels.items():
         edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
         with warnings.catch_warnings():
@@ -368,6 +372,8 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
             "label": panel.label,
             **written_panel(panel),
         }
+        if panel.patches:
+            panels[name]["hood"] = panels[name].get("hood", {}) | written_patches(panel)
     stitches: list[list[Any]] = []
     for stitch in pattern.stitches:
         sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.making import Fastener, construction_of
+from hood.assets.pattern.making import Fastener, construction_of, folded
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
 from hood.mesh.flat import Construction
@@ -19,6 +19,8 @@ _FROM_OUTLINE = 0.6
 #: An end of a fold within this [m] of the outline is on it, and within this share of the edge length of a corner in that;
 #: points of a side that tell where it is.
 _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
+#: Pieces of folds are halved so often at most.
+_HALVED = 5
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
 #: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
@@ -117,7 +119,8 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         exact = np.concatenate([side.evenly(_CURVED) for side in panel.edges])
         tables.append(points - exact.min(axis=0) + [at, 0.0])  # in one place, whatever the edge length
         at += float(np.ptp(exact[:, 0])) + _MARGIN
-        placed.append(panel.placed(points))
+        laid = folded(points, panel.folds, np.sign(_signed_area(exact)))
+        placed.append(laid @ panel.rotation.T + panel.translation)
         faces.append(triangles + start)
         owner.append(np.full(len(triangles), number))
         start += len(points)
@@ -289,7 +292,7 @@ def _meshed(
     triangles = np.zeros((0, 3), dtype=np.int64)
     if len(outline) >= 3:
         triangles = Delaunay(points).simplices.astype(np.int64)
-        triangles = triangles[_inside(points[triangles].mean(axis=1), outline)]
+        triangles = triangles[inside(points[triangles].mean(axis=1), outline)]
         corners = points[triangles]
         area = np.linalg.det(corners[:, 1:] - corners[:, :1])
         triangles = triangles[np.abs(area) > 1e-6 * edge * edge]
@@ -335,7 +338,7 @@ def _creased(
         tips = []
         for place, end in zip(places, (fold.start, fold.end), strict=True):
             if place is None:
-                if not _inside(end[None], outline)[0]:
+                if not inside(end[None], outline)[0]:
                     x, y = 1e2 * end
                     raise ValueError(
                         f"{where}: panel {panel.name!r}: the end ({x:.1f}, {y:.1f}) cm of a fold is outside; move it"
@@ -351,7 +354,23 @@ def _creased(
         points.append((1.0 - share) * start + share * last)
         creases.append(np.array([tips[0], *range(count, count + parts - 1), tips[1]]))
         count += parts - 1
-    return np.concatenate(points), creases
+    return _divided(np.concatenate(points), creases)
+
+
+def _divided(points: np.ndarray, creases: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The same with pieces of folds divided in half while another point lies in the circle around one: those that no circle
+    has another point in are sides of triangles."""
+    for _ in range(_HALVED if creases else 0):
+        tree, before = cKDTree(points), len(points)
+        for number, line in enumerate(creases):
+            start, end = points[line[:-1]], points[line[1:]]
+            middle, radius = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=1)
+            near = np.flatnonzero(tree.query(middle)[0] < (1.0 - 1e-6) * radius)
+            creases[number] = np.insert(line, near + 1, len(points) + np.arange(len(near)))
+            points = np.concatenate([points, middle[near]])
+        if len(points) == before:
+            break
+    return points, creases
 
 
 def _signed_area(outline: np.ndarray) -> float:
@@ -367,7 +386,7 @@ def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
     columns = np.arange(low[0] + 0.25 * edge, high[0], edge)
     x = columns[None] + 0.5 * edge * (np.arange(len(rows))[:, None] % 2)
     points = np.stack([x, np.broadcast_to(rows[:, None], x.shape)], axis=-1).reshape(-1, 2)
-    points = points[_inside(points, outline)] if len(points) else points
+    points = points[inside(points, outline)] if len(points) else points
     if not len(points):
         return np.zeros((0, 2))
     nearest, _ = cKDTree(_dense(outline, edge)).query(points)
@@ -382,7 +401,7 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
 
 
-def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
     (x, y), following = outline.T, np.roll(outline, -1, axis=0)
     u, v = following.T

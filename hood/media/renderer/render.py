@@ -38,7 +38,7 @@ from hood.media.renderer.raster import (
     unit,
 )
 from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
-from hood.mesh.topology import counted_edges
+from hood.mesh.topology import connected_components, counted_edges
 
 _Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ _DETOUR = 1.5
 def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     """Distance [m] of every vertex from the next open edge of its surface, (V,); :data:`FAR` where none is near.
 
-    Near is what is near along the surface: a sleeve beside the waist is not.
+    Near is what is near along the surface: a sleeve beside the waist is not, nor a pocket upon a hem.
 
     Args:
         pos: (V, 3) [m], at rest.
@@ -75,11 +75,13 @@ def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     graph = coo_matrix((np.maximum(length, 1e-9), (edges[:, 0], edges[:, 1])), shape=2 * (len(points),))
     along = dijkstra(graph, directed=False, indices=np.unique(open_edges), min_only=True, limit=_REACH)
     share = np.linspace(0.0, 1.0, _SAMPLES)[:, None, None]
-    start, end = points[open_edges[:, 0]], points[open_edges[:, 1]]
-    dist, _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points)
-    near = np.isfinite(along)
-    # A layer below has an edge, too, which is nearer than along the surface.
-    result[near] = np.where(along > _DETOUR * dist, along, dist)[near]
+    near, part = np.isfinite(along), connected_components(len(points), edges)
+    for own in np.unique(part[open_edges[:, 0]]):
+        start, end = points[open_edges[part[open_edges[:, 0]] == own].T]
+        rows = near & (part == own)
+        dist, _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points[rows])
+        # A layer below has an edge, too, which is nearer than along the surface.
+        result[rows] = np.where(along[rows] > _DETOUR * dist, along[rows], dist)
     return result
 
 
@@ -161,6 +163,8 @@ SHEEN, FUZZ = 0.06, 0.10
 _SUPERSAMPLING = 2
 #: Share of its colour that a face seen from inside shows.
 _INSIDE = 0.62
+#: A face whose normal has less than this [cosine] in common with the mean at a vertex is beyond a fold there.
+_CREASE = 0.5
 
 
 @dataclass(frozen=True)
@@ -277,8 +281,12 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
             raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
         behind = np.full(len(pos), mesh.behind)
         shine = np.broadcast_to(np.asarray(mesh.shine, dtype=np.float64), pos.shape)
-        parts.append((pos, faces + offset, linear, _vertex_normals(pos, faces), hem, behind, shine))
-        offset += len(pos)
+        normal = _vertex_normals(pos, faces)
+        faces, carrier, own = _creased(pos, faces, normal)
+        rows = [values[carrier] for values in (pos, linear, normal, hem, behind, shine)]
+        rows[2][len(pos) :] = own
+        parts.append((rows[0], faces + offset, *rows[1:]))  # type: ignore[arg-type]
+        offset += len(carrier)
     return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -386,6 +394,30 @@ def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
         sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
     ]
     return unit(np.stack(total, axis=1))
+
+
+def _creased(pos: _Array, faces: NDArray[np.int64], normal: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64], _Array]:
+    """Faces with their own vertices where the mean normal (V, 3) of a vertex is not theirs, as in a pleat; the vertex (V + N,)
+    that each stands for, and the normals (N, 3) of the new ones."""
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    flat = unit(np.cross(b - a, c - a))
+    off = np.einsum("fx,fkx->fk", flat, normal[faces]) < _CREASE
+    off &= np.abs(flat).sum(axis=1, keepdims=True) > 0.5
+    own = np.argwhere(off)
+    if not len(own):
+        return faces, np.arange(len(pos)), np.zeros((0, 3))
+    vertex = faces[off]
+    order = np.argsort(faces, axis=None, kind="stable")
+    ends = np.searchsorted(faces.reshape(-1)[order], [vertex, vertex + 1])
+    count = ends[1] - ends[0]
+    row = np.repeat(np.arange(len(own)), count)
+    around = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - ends[0], count)] // 3
+    # Of the faces around the vertex those on this side of the fold share its normal.
+    alike = (flat[around] * flat[own[row, 0]]).sum(axis=1) > 0.5
+    total = np.stack([np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)], axis=1)
+    faces = faces.copy()
+    faces[off] = len(pos) + np.arange(len(own))
+    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(total)
 
 
 def _blend(weights: _Array, values: _Array, corners: NDArray[np.int64]) -> _Array:

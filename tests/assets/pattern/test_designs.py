@@ -19,8 +19,8 @@ from hood.mesh import topology
 #: Openings of every design without sleeves; sleeves change none of them.
 OPENINGS = {
     **dict.fromkeys(("tank", "tshirt", "shirt", "blouse", "bodice", "sheath", "dress", "swing", "shift"), 4),
-    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "poncho", "cape"), 2),
-    **dict.fromkeys(("trousers", "leggings", "shorts"), 3),
+    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "poncho", "cape"), 2),
+    **dict.fromkeys(("trousers", "leggings", "shorts", "jeans"), 3),
     "hoodie": 4,
     "jumpsuit": 5,
 }
@@ -107,7 +107,7 @@ def test_a_written_design_is_read_back(name: str, bodies: list[Measures], tmp_pa
 
 def test_a_waistband_is_as_long_as_the_waist(bodies: list[Measures]) -> None:
     for measures in bodies:
-        for name in ("skirt", "pencil", "circle", "gathered", "tiered"):
+        for name in ("skirt", "pencil", "circle", "gathered", "tiered", "pleated"):
             pattern = draft(name, measures)
             rim = [edge.length for panel in pattern.panels.values() for edge in panel.edges if panel.name.startswith("band")]
             top = [
@@ -129,7 +129,9 @@ def test_a_cap_is_as_long_as_its_armhole_and_a_little(bodies: list[Measures]) ->
 
 def lengths(name: str, measures: Measures, options: dict[str, Any]) -> list[float]:
     panels = draft(name, measures, options).panels.values()
-    return [round(edge.length, 6) for panel in panels for edge in panel.edges]
+    found = [edge.length for panel in panels for edge in panel.edges]
+    found += [value for panel in panels for patch in panel.patches for value in patch.outline.reshape(-1)]
+    return [round(float(value), 6) for value in found]
 
 
 @pytest.mark.parametrize("name", DESIGNS)
