@@ -151,29 +151,31 @@ def joints_of(posed: PosedBody) -> np.ndarray:
 def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     """Which of the trunk, the left and right arm and leg have a bone that passes through the opening with the rim (N, 3) [m].
 
-    Head and neck are of the trunk, and both legs are as good as it. Shoulders beside the trunk are not told: a wide neckline
-    has them in it.
+    Head and neck are of the trunk, and both legs are as good as it, each below its hip or at it. Shoulders beside the trunk are
+    not told: a wide neckline has them in it.
     """
     joints, parents = joints_of(posed), posed.body.parents
     after = np.roll(rim, -1, axis=0)
     middle = rim.mean(axis=0)
     found: set[str] = set()
     near: set[str] = set()
+    hips: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
         limb = _limb(joint)
         if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
-            (near if JOINTS[joint].endswith("shoulder") else found).add(limb)
-    if {"left leg", "right leg"} <= found:
+            (near if JOINTS[joint].endswith("shoulder") else hips if JOINTS[joint].endswith("hip") else found).add(limb)
+    if {"left leg", "right leg"} <= found | hips:
         found = (found - {"left leg", "right leg"}) | {"trunk"}
     return frozenset(found if "trunk" in found else found | near)
 
 
 def _limb(joint: int) -> str | None:
-    """What the bone that ends in a joint belongs to; None: to the hips or the collar."""
+    """What the bone that ends in a joint belongs to; None: to the collar."""
     side, _, name = JOINTS[joint].partition("_")
     if not name:
         return "trunk"
-    kind = {"shoulder": "arm", "elbow": "arm", "wrist": "arm", "knee": "leg", "ankle": "leg", "foot": "leg"}.get(name)
+    kinds = {"arm": ("shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "foot")}
+    kind = next((kind for kind, names in kinds.items() if name in names), None)
     return None if kind is None else f"{side} {kind}"
 
 

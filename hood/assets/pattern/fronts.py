@@ -240,13 +240,15 @@ def _interface(t: Table, *names: str) -> None:
 
 def quilted(t: Table, height: float, *names: str) -> None:
     """Panels with level seams so far [m] from each other, at one height in all of them, which stand in: the cloth between two
-    is a tube."""
-    low = min(float(edge.start[1]) for name in names for edge in t.panels[name].edges)
+    is a tube. They are as far as can be from the corners of the panels."""
+    corners = np.unique([edge.start[1] for name in names for edge in t.panels[name].edges])
+    ways = [np.arange(corners[0] + share * height, corners[-1], height) for share in np.linspace(0.5, 1.5, 41)]
+    levels = max(ways, key=lambda way: float(np.abs(way[:, None] - corners).min()))
     for name in names:
         panel, folds = t.panels[name], []
         outline = np.concatenate([edge.evenly(_FINE)[:-1] for edge in panel.edges])
         after = np.roll(outline, -1, axis=0)
-        for level in np.arange(low + height, outline[:, 1].max(), height):
+        for level in levels:
             through = (outline[:, 1] < level) != (after[:, 1] < level)
             share = (level - outline[through, 1]) / (after[through, 1] - outline[through, 1])
             ends = np.sort(outline[through, 0] + share * (after[through, 0] - outline[through, 0]))

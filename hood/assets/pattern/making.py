@@ -260,13 +260,13 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
 
 
 def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
-    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not meet; without, flat.
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are folds that do not meet, one way and back; without, flat.
 
     Args:
         outer: 1, or -1 for a panel whose outer side is at negative z.
     """
     flat = np.pad(points, ((0, 0), (0, 1)))
-    if len(folds) < 2:
+    if len({fold.angle > 0.0 for fold in folds}) < 2:
         return flat
     ways = [fold.end - fold.start for fold in folds]
     ways = [way / np.linalg.norm(way) * np.sign(way @ ways[0]) for way in ways]
