@@ -117,4 +117,6 @@ def test_laid_pleats_keep_lengths_and_are_as_wide_as_what_is_seen(measures: Meas
         assert 0.005 < np.ptp(laid[:, 2]) < 0.06
     flat = np.array([[0.0, 0.0], [1.0, 2.0]])
     one = Fold(np.array([0.5, 0.0]), np.array([0.5, 1.0]), 2.0)
-    np.testing.assert_array_equal(folded(flat, [one], 1.0), [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
+    other = Fold(np.array([0.0, 0.5]), np.array([1.0, 0.5]), 2.0)  # crosses it: these are no pleats
+    for folds in ([one], [one, other]):
+        np.testing.assert_array_equal(folded(flat, folds, 1.0), [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
