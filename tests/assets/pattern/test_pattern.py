@@ -12,7 +12,7 @@ import torch
 from sewing_patterns import PATTERNS, panel, skirt, specification, write
 
 from hood.assets.material import Material
-from hood.assets.pattern.making import with_elastic
+from hood.assets.pattern.making import EdgeMaking, with_elastic
 from hood.assets.pattern.pattern import Edge, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
