@@ -46,9 +46,17 @@ from hood.cli.main import ENVIRONMENT
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, StepInput
 from hood.contact.contact import Contact
-from hood.model.graph.builder import BODY, Graph, build_graph, build_static
+from hood.model.graph.builder import (
+    BODY,
+    Graph,
+    build_graph,
+    build_static,
+    edge_set_names,
+    finest_level,
+    parse_schedule,
+    set_level,
+)
 from hood.model.graph.hierarchy import build_hierarchy
-from hood.model.graph.schedule import edge_set_names, finest_level, parse_schedule, set_level
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.model.network.model import MeshGraphNet

@@ -26,7 +26,7 @@ from recipes import ONE_PASS, Recipe, cell, fast, folder_of, run
 
 from hood.assets.body.load import load_body
 from hood.assets.files.atomic import write_atomically
-from hood.model.graph.schedule import parse_schedule, radius
+from hood.model.graph.builder import parse_schedule, radius
 
 SCHEDULES = ("fine15", "ours", "fine48")
 #: In the order in which they are trained: first what spans the ratios, then what separates edge from frame rate.

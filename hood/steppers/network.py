@@ -20,10 +20,19 @@ from hood.mesh.closest_point.vertices import Nearest
 from hood.model.features import compiled
 from hood.model.features.feature_set import FeatureSet
 from hood.model.features.inputs import EdgeRows, Inputs
-from hood.model.graph.builder import Graph, StaticGraph, build_graph, build_static, find_near_cloth
+from hood.model.graph.builder import (
+    Graph,
+    StaticGraph,
+    build_graph,
+    build_static,
+    edge_set_names,
+    find_near_cloth,
+    parse_passes,
+    parse_schedule,
+    set_level,
+)
 from hood.model.graph.hierarchy import Hierarchy, concatenate_hierarchies, num_passed_over
 from hood.model.graph.known_hierarchies import template_hierarchy
-from hood.model.graph.schedule import edge_set_names, parse_passes, parse_schedule, set_level
 from hood.model.network.model import MeshGraphNet
 from hood.model.parts import MULTILEVEL, OUTPUTS, SETS, SetSettings, build_features, network_class, output_class, split_name
 from hood.model.readout.network_step import Dirichlet, Feedback, NetworkStep

@@ -26,8 +26,7 @@ from torch import Tensor
 
 from hood.assets.pickles.content import load_torch
 from hood.assets.pickles.unpickle import PICKLE_LIMIT
-from hood.model.graph.builder import BODY, MESH
-from hood.model.graph.schedule import SCHEDULES, Step, edge_set_names, parse_schedule
+from hood.model.graph.builder import BODY, MESH, SCHEDULES, Step, edge_set_names, parse_schedule
 from hood.steppers.network import NetworkStepper, build_simulator
 
 MODEL = "model."

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hood.evaluation.table import measured_radius
-from hood.model.graph.schedule import parse_schedule, radius
+from hood.model.graph.builder import parse_schedule, radius
 from hood.steppers.network import build_simulator
 
 

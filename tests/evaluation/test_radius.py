@@ -7,9 +7,8 @@ from scipy.sparse import csgraph
 from hood.assets.material import Material
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import StepInput
-from hood.model.graph.builder import build_graph, build_static
+from hood.model.graph.builder import build_graph, build_static, radius
 from hood.model.graph.hierarchy import adjacency, build_hierarchy
-from hood.model.graph.schedule import radius
 from hood.model.network.model import MeshGraphNet
 from hood.testing import strip
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from hood.native import build as native_build
-from hood.native import prebuilt
 from hood.native.build import BuildError, Level, build, find_compiler
 
 FLAGS = ("-O0", "-shared", "-fPIC", "-march=native")
@@ -21,8 +20,7 @@ def source(compiler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     """A source whose library says for which of two generations it was made."""
     path = tmp_path / "lanes.cpp"
     path.write_text(SOURCE)
-    for module in (prebuilt, native_build):
-        monkeypatch.setattr(module, "levels", lambda: LEVELS)
+    monkeypatch.setattr(native_build, "levels", lambda: LEVELS)
     monkeypatch.setattr(native_build, "LIBRARIES", ((path, FLAGS),))
     monkeypatch.setattr(native_build, "SELDOM", ())
     chosen = {"wide": "-DWIDE", "plain": "-DPLAIN"}
@@ -38,8 +36,8 @@ def test_the_widest_that_the_processor_can_run_is_taken(source, tmp_path):
     made, left_out = native_build.make(tmp_path)
     assert len(made) == 2
     assert not left_out
-    assert prebuilt.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 16
-    assert prebuilt.prebuilt(tmp_path, source, FLAGS, frozenset()).lanes() == 2
+    assert native_build.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 16
+    assert native_build.prebuilt(tmp_path, source, FLAGS, frozenset()).lanes() == 2
 
 
 def test_no_compiler_is_needed_where_a_library_is_prebuilt(source, tmp_path, monkeypatch):
@@ -55,7 +53,7 @@ def test_no_compiler_is_needed_where_a_library_is_prebuilt(source, tmp_path, mon
 def test_a_damaged_library_leaves_the_next(source, tmp_path):
     made, _ = native_build.make(tmp_path)
     next(path for path in made if "wide" in path.name).write_bytes(b"half a file")
-    assert prebuilt.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 2
+    assert native_build.prebuilt(tmp_path, source, FLAGS, frozenset({"everything"})).lanes() == 2
 
 
 def test_what_cannot_be_compiled_is_left_out_and_named(source, tmp_path, monkeypatch):
@@ -79,7 +77,7 @@ def test_the_list_names_what_the_modules_ask_for():
 
 
 def test_every_architecture_ends_with_a_level_that_runs_everywhere():
-    for generations in prebuilt.LEVELS.values():
+    for generations in native_build.LEVELS.values():
         assert not generations[-1].needs
         assert all(narrow.needs <= wide.needs for wide, narrow in zip(generations, generations[1:], strict=False))
 

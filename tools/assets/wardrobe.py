@@ -99,7 +99,7 @@ def _sew(piece: Piece, edge: float, path: Path) -> None:
 def write_rounded(path: Path, garment: Garment) -> None:
     """Write a sewn garment in few bytes: rounded, its flat pattern as its texture coordinates."""
     arrays = as_arrays({field.name: getattr(garment, field.name) for field in fields(garment)})
-    if not np.array_equal(garment.flat, np.asarray(garment.uv)[garment.uv_faces], equal_nan=False):
+    if garment.flat is None or not np.array_equal(garment.flat, np.asarray(garment.uv)[garment.uv_faces]):
         raise RuntimeError(f"{path.stem}: its texture coordinates are not its flat pattern")
     arrays["flat"] = np.array(True)
     steps = {"rest_pos": _POSITION, "skin_pos": _POSITION, "shapedirs": _SHAPE, "lbs_weights": _WEIGHT}

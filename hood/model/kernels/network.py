@@ -17,8 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from hood import native
-from hood.model.graph.builder import EdgeSet, Graph
-from hood.model.graph.schedule import finest_level
+from hood.model.graph.builder import EdgeSet, Graph, finest_level
 from hood.native.arguments import COUNT, POINTER, fields
 from hood.native.build import NATIVE_FLAGS, build
 

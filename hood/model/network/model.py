@@ -13,8 +13,18 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from hood.model.graph.builder import BODY, LAYERS, MESH, Graph, coarse_name, set_level
-from hood.model.graph.schedule import edge_set_names, finest_level, parse_passes, parse_schedule
+from hood.model.graph.builder import (
+    BODY,
+    LAYERS,
+    MESH,
+    Graph,
+    coarse_name,
+    edge_set_names,
+    finest_level,
+    parse_passes,
+    parse_schedule,
+    set_level,
+)
 from hood.model.kernels import network
 from hood.model.kernels.block import check_kernels
 from hood.model.network.message_passing import EdgeDecoder, ProcessorStep
@@ -96,7 +106,7 @@ class MeshGraphNet(nn.Module):
             its own name first and by ``coarse`` then; a missing ``coarse`` means the mesh's width. With ``layers`` the model
             has edges between layers of cloth.
         latent_dim: width of all latents (paper: 128).
-        schedule: name or text for :func:`hood.model.graph.schedule.parse_schedule`.
+        schedule: name or text for :func:`hood.model.graph.builder.parse_schedule`.
         out_width: width of the output.
         aggregation: ``sum`` or ``mean`` of the messages at a node.
         output_init: factor on the decoder's last layer at initialisation; small values start near zero output.

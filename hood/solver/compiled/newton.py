@@ -34,9 +34,8 @@ from hood.native.build import NATIVE_FLAGS, WIDE_FLAGS, build
 from hood.solver.compiled.tables import Tables
 from hood.solver.derivatives.compiled_vertices import whole
 from hood.solver.derivatives.elements import face_constants, hinge_constants
-from hood.solver.derivatives.points import PointForces, point_forces
 from hood.solver.derivatives.self_contact import grips_of, layers_of
-from hood.solver.derivatives.step_terms import stretch_rate
+from hood.solver.derivatives.step_terms import PointForces, point_forces, stretch_rate
 from hood.solver.derivatives.vertices import VertexForces, known_forces, terms_without_form
 from hood.solver.system.iterate import fixed_positions
 

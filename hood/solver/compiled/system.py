@@ -35,8 +35,8 @@ from hood.solver.compiled.newton import (
 )
 from hood.solver.compiled.tables import Tables, build_tables, point_uses
 from hood.solver.derivatives.compiled_vertices import drag_structures, grip_structures, wall_structures
-from hood.solver.derivatives.points import PointForces
 from hood.solver.derivatives.self_contact import approached
+from hood.solver.derivatives.step_terms import PointForces
 from hood.solver.system.linear import TOLERANCES
 from hood.solver.system.plan import SolverPlan
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hood.energies.contact import Walls
 from hood.energies.laws import contact_push
-from hood.solver.derivatives.points import PointForces
+from hood.solver.derivatives.step_terms import PointForces
 from hood.solver.system.iterate import Iterate, Unknowns
 from hood.tensors.dense import add_rows
 

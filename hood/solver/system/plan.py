@@ -16,9 +16,8 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerGrips
 from hood.solver.derivatives import elements
-from hood.solver.derivatives.points import PointBlocks, point_blocks
 from hood.solver.derivatives.self_contact import LayerRows, layer_rows
-from hood.solver.derivatives.step_terms import StepTerms
+from hood.solver.derivatives.step_terms import PointBlocks, StepTerms, point_blocks
 from hood.solver.system.sparsity import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
 from hood.tensors.batch import made_of
 

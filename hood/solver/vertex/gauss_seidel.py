@@ -22,8 +22,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import has_layers
 from hood.solver.derivatives import elements
 from hood.solver.derivatives.elements import Corners, FaceConstants, HingeConstants
-from hood.solver.derivatives.points import PointForces
-from hood.solver.derivatives.step_terms import StepTerms
+from hood.solver.derivatives.step_terms import PointForces, StepTerms
 from hood.solver.derivatives.vertices import VertexForces
 from hood.solver.step_figures import MOST_ITERATIONS, NO_PROGRESS, NOT_FINITE, STOPPED
 from hood.solver.system.iterate import Iterate, Proceed, Progress, Unknowns, first_iterate, in_double, rounded

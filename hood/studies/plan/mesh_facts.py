@@ -19,8 +19,8 @@ from hood.app.setup import Setup
 from hood.app.stepping.cloth_contact import acts, why_not
 from hood.assets.files.library import locate, names
 from hood.cloth.cloth import Cloth
+from hood.model.graph.builder import edge_set_names, parse_schedule, radius
 from hood.model.graph.hierarchy import num_passed_over
-from hood.model.graph.schedule import edge_set_names, parse_schedule, radius
 from hood.steppers.checkpoint import CAUTION, read_header
 from hood.steppers.static_shapes.simulator import network_of
 from hood.studies.plan.ablation import Begun, Effect

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hood.model.graph.schedule import edge_set_names, finest_level, parse_passes, parse_schedule, radius
+from hood.model.graph.builder import edge_set_names, finest_level, parse_passes, parse_schedule, radius
 
 
 def test_ours_is_the_papers_fifteen_steps():

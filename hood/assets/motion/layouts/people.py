@@ -273,17 +273,17 @@ def _rows(entry: Any) -> list[dict[str, Any]]:
     else:
         count = 1 if _is_row(entry) else len(fields[layout.poses[0]])
         if count == 1:
-            return [_named(dict(fields))]
+            return [_with_person(dict(fields))]
     rows = []
     for index in range(count):
         own = {key: value[index] for key, value in fields.items() if length(value) == count}
         if poses is not None and isinstance(poses[index], Mapping):
             own |= {squeezed(key): value for key, value in poses[index].items()}
-        rows.append(_named(own))
+        rows.append(_with_person(own))
     return rows
 
 
-def _named(row: dict[str, Any]) -> dict[str, Any]:
+def _with_person(row: dict[str, Any]) -> dict[str, Any]:
     name = next((row[key] for key in _IDS if key in row), None)
     number = flat(name)
     if name is not None and len(number) == 1 and number.dtype.kind in "iu":
