@@ -115,20 +115,18 @@ def _rider(
     normals: np.ndarray,
 ) -> Riders:
     """One of them: its upper side between points of the outline and the cloth's own inside, and a rim down to the cloth."""
-    from hood.assets.pattern.sheet import in_triangles, inside
-
     flat, corners = sheet.uv[sheet.uv_faces[own]], sheet.faces[own]
     rows = np.unique(sheet.uv_faces[own])
     start = sheet.uv[rows[sheet.outline[rows] == 0.0][0]]
     ring = _divided(patch.outline + start - panel.edges[0].start)
-    inner = sheet.uv[rows][inside(sheet.uv[rows], ring)]
+    inner = sheet.uv[rows][_inside(sheet.uv[rows], ring)]
     inner = inner[cKDTree(ring).query(inner)[0] > 0.5 * _STEP] if len(inner) and not patch.rigid else inner[:0]
     points = np.concatenate([ring, inner])
     triangles = Delaunay(points).simplices.astype(np.int64)
     area = np.linalg.det(points[triangles][:, 1:] - points[triangles][:, :1])
-    whole = inside(points[triangles].mean(axis=1), ring) & (np.abs(area) > _NO_AREA)
+    whole = _inside(points[triangles].mean(axis=1), ring) & (np.abs(area) > _NO_AREA)
     triangles, area = triangles[whole], area[whole]
-    face, bary = in_triangles(points, flat)
+    face, bary = sheet.located(points, own)
     # Wound as the cloth beneath; and the ring as the triangles.
     outer = np.sign(np.linalg.det(flat[:, 1:] - flat[:, :1]).sum())
     triangles[area * outer < 0] = triangles[area * outer < 0][:, ::-1]
@@ -155,3 +153,11 @@ def _divided(outline: np.ndarray) -> np.ndarray:
         count = max(int(np.ceil(np.linalg.norm(end - start) / _STEP)), 1)
         pieces.append(start + np.arange(count)[:, None] / count * (end - start))
     return np.concatenate(pieces)
+
+
+def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 2) that a closed outline turns around."""
+    ways = outline - points[:, None]
+    seen = ways[..., 0] + 1j * ways[..., 1]
+    turn = np.angle(np.roll(seen, -1, axis=1) * seen.conj()).sum(axis=1)
+    return np.asarray(np.abs(turn) > np.pi)

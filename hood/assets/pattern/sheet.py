@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.making import construction_of, folded
+from hood.assets.pattern.making import construction_of, laid
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
 from hood.mesh.flat import Construction
@@ -70,6 +70,10 @@ class PatternSheet:
             found[self.faces[(self.made.elastic != 1.0).any(axis=1)]] = True
         return found
 
+    def located(self, points: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the faces ``own`` (F,) bool points (N, 2) of ``uv`` lie in, (N,), and the weights (N, 3) of its corners."""
+        return _in_triangles(points, self.flat[own])
+
     @property
     def welds(self) -> np.ndarray:
         """(U,) vertex of every point of ``uv``."""
@@ -108,9 +112,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         exact = np.concatenate([side.evenly(_CURVED) for side in panel.edges])
         tables.append(points - exact.min(axis=0) + [at, 0.0])  # in one place, whatever the edge length
         at += float(np.ptp(exact[:, 0])) + _MARGIN
-        across = all(place is not None for places in ends[panel.name] for place in places)
-        laid = folded(points, panel.folds if across else (), np.sign(_signed_area(exact)))
-        placed.append(laid @ panel.rotation.T + panel.translation)
+        placed.append(_begun(panel, points, ends[panel.name]))
         faces.append(triangles + start)
         owner.append(np.full(len(triangles), number))
         start += len(points)
@@ -168,7 +170,7 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
             distance, nearest = cKDTree(fine.uv[rim]).query(fine.uv[inner])
             reach = np.sqrt(np.abs(np.linalg.det(coarse.uv[own][:, 1:] - coarse.uv[own][:, :1])).mean())
             share = np.clip(1.0 - distance / reach, 0.0, 1.0)
-            face, bary = in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
+            face, bary = _in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
             found[~on_rim] = np.einsum("nk,nkx->nx", bary, at[own[face]])
         np.add.at(total, welds[rows], found)
         np.add.at(count, welds[rows], 1.0)
@@ -180,7 +182,7 @@ def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarra
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
 
 
-def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
@@ -195,6 +197,13 @@ def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, n
 
 #: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.
 _Place = tuple[int, float] | None
+
+
+def _begun(panel: PatternPanel, points: np.ndarray, ends: list[tuple[_Place, _Place]]) -> np.ndarray:
+    """(N, 3) m: where points (N, 2) of a panel begin, its pleats laid; these are folds from outline to outline."""
+    across = all(place is not None for pair in ends for place in pair)
+    outer = float(np.sign(_signed_area(np.array([edge.start for edge in panel.edges]))))
+    return np.asarray(laid(points, panel.folds if across else (), outer) @ panel.rotation.T + panel.translation)
 
 
 def _fold_ends(panel: PatternPanel, edge: float) -> list[tuple[_Place, _Place]]:
@@ -266,7 +275,7 @@ def _meshed(
     triangles = np.zeros((0, 3), dtype=np.int64)
     if len(outline) >= 3:
         triangles = Delaunay(points).simplices.astype(np.int64)
-        triangles = triangles[inside(points[triangles].mean(axis=1), outline)]
+        triangles = triangles[_inside(points[triangles].mean(axis=1), outline)]
         corners = points[triangles]
         area = np.linalg.det(corners[:, 1:] - corners[:, :1])
         triangles = triangles[np.abs(area) > 1e-6 * edge * edge]
@@ -312,7 +321,7 @@ def _creased(
         tips = []
         for place, end in zip(places, (fold.start, fold.end), strict=True):
             if place is None:
-                if not inside(end[None], outline)[0]:
+                if not _inside(end[None], outline)[0]:
                     x, y = 1e2 * end
                     raise ValueError(
                         f"{where}: panel {panel.name!r}: the end ({x:.1f}, {y:.1f}) cm of a fold is outside; move it"
@@ -360,7 +369,7 @@ def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
     columns = np.arange(low[0] + 0.25 * edge, high[0], edge)
     x = columns[None] + 0.5 * edge * (np.arange(len(rows))[:, None] % 2)
     points = np.stack([x, np.broadcast_to(rows[:, None], x.shape)], axis=-1).reshape(-1, 2)
-    points = points[inside(points, outline)] if len(points) else points
+    points = points[_inside(points, outline)] if len(points) else points
     if not len(points):
         return np.zeros((0, 2))
     nearest, _ = cKDTree(_dense(outline, edge)).query(points)
@@ -375,7 +384,7 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
 
 
-def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
     (x, y), following = outline.T, np.roll(outline, -1, axis=0)
     u, v = following.T
