@@ -1,4 +1,4 @@
-"""Rebuilds the embedded default assets: python scripts/build_assets.py [body] [garments] [motions]."""
+"""Rebuilds the embedded default assets: python scripts/build_assets.py [body] [garments] [wardrobe] [motions]."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hood.assets.files.library import DATA_FOLDER
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tools/ is not installed
 
-PARTS = ("body", "garments", "motions")
+PARTS = ("body", "garments", "wardrobe", "motions")
 
 
 def main() -> None:
@@ -34,6 +34,10 @@ def main() -> None:
         from tools.assets.tailor import build_garments
 
         print("garments:", build_garments(options.out / "garments", body_path))
+    if "wardrobe" in parts:
+        from tools.assets.wardrobe import build_wardrobe
+
+        print("wardrobe:", build_wardrobe(options.out / "garments"))
     if "motions" in parts:
         from tools.assets.choreography import write_motions
 

@@ -1,6 +1,7 @@
-"""The picture of docs/gallery.md, all garments in three fabrics: ``python scripts/gallery.py docs/images/gallery.png``.
+"""The picture of docs/gallery.md, the wardrobe, a fabric each: ``python scripts/gallery.py docs/images/gallery.png``.
 
-Each is simulated by the solver at 4,000 vertices, and shown where it has come in the same moment of the same dance.
+Each is simulated by the solver at 4,000 vertices, and shown where it has come in the same moment of the same dance; the last
+row is one of them in three fabrics more.
 """
 
 from __future__ import annotations
@@ -12,12 +13,33 @@ import numpy as np
 from PIL import Image
 
 import hood
-from hood.media.renderer.render import BODY_COLOR, Camera, RenderMesh, contact_sheet, hem_distance, render_frame
+from hood.media.film import Film
+from hood.media.renderer.render import contact_sheet
+from hood.rollouts.file.reader import RolloutData
 
-GARMENTS = ("tshirt", "longsleeve", "tank", "dress", "skirt", "shorts", "trousers")
-#: Fabrics and the colour that each is drawn in, sRGB.
-FABRICS = {"jersey": (0.80, 0.45, 0.22), "denim": (0.20, 0.30, 0.52), "silk": (0.62, 0.28, 0.42)}
+#: Garments and their fabrics.
+WORN = (
+    ("blouse", "cotton_poplin"),
+    ("blazer", "wool_suiting"),
+    ("bomber", "coated_nylon"),
+    ("gilet", "nappa_leather"),
+    ("hoodie", "double_knit"),
+    ("poncho", "wool_felt"),
+    ("apron", "linen"),
+    ("jeans", "denim_12oz"),
+    ("leggings", "cotton_jersey"),
+    ("jumpsuit", "cotton_canvas"),
+    ("swing", "silk_crepe"),
+    ("sheath", "wool_suiting"),
+    ("wrap", "jersey"),
+    ("tiered", "chiffon"),
+    ("circle", "silk_habotai"),
+    ("circle", "denim_12oz"),
+    ("pleated", "wool_suiting"),
+    ("pleated", "silk"),
+)
 SEQUENCE, NUM_FRAMES = "dance_mixed", 60
+_COLUMNS = 6
 _WIDTH, _HEIGHT = 230, 330  # pixels of one still
 _AZIMUTH = 25.0  # degrees
 _LEVEL = 3  # channels are multiples of it, which no eye sees and makes the file a third smaller
@@ -30,24 +52,20 @@ def still(garment: str, fabric: str) -> np.ndarray:
     )
     *_, last = simulation
     body, cloth = last.body_pos.numpy(), last.world_pos.numpy()
-    camera = Camera.framing(body[None], _AZIMUTH, 8.0, aspect=_WIDTH / _HEIGHT)
     worn = simulation.scene.garment
-    meshes = [
-        RenderMesh(body, simulation.scene.motion.faces, BODY_COLOR, behind=1e-3),
-        RenderMesh(cloth, worn.faces, FABRICS[fabric], hem_distance(worn.rest_pos, worn.faces)),
-    ]
-    return render_frame(meshes, camera, width=_WIDTH, height=_HEIGHT)
+    said = {"garment": worn.name, "fabric_names": fabric}
+    data = RolloutData(cloth[None], worn.faces, worn.rest_pos, body[None], simulation.scene.motion.faces, np.zeros(1), {}, said)
+    return Film(data, _WIDTH, _HEIGHT, azimuth_deg=_AZIMUTH).picture(0)
 
 
 def draw(picture: Path) -> None:
-    """Write the sheet: a row for every fabric, a column for every garment."""
+    """Write the sheet."""
     pages, names = [], []
-    for fabric in FABRICS:
-        for garment in GARMENTS:
-            print(f"{garment}, {fabric}", flush=True)
-            pages.append(still(garment, fabric))
-            names.append(f"{garment}, {fabric}")
-    sheet = contact_sheet(pages, len(GARMENTS), names).astype(np.int64)
+    for garment, fabric in WORN:
+        names.append(f"{garment}, {fabric}")
+        print(names[-1], flush=True)
+        pages.append(still(garment, fabric))
+    sheet = contact_sheet(pages, _COLUMNS, names).astype(np.int64)
     fewer = np.minimum((sheet + _LEVEL // 2) // _LEVEL * _LEVEL, 255).astype(np.uint8)
     Image.fromarray(fewer).save(picture, optimize=True)
 

@@ -31,7 +31,7 @@ from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.frames import ridden_faces, ridden_rest
-from hood.rollouts.sewing import sew_pattern, waist_of
+from hood.rollouts.sewing import sew_pattern, sewn_open, waist_of
 from hood.rollouts.sewn import Sewn
 
 #: Exit code of a garment that is not sewn well.
@@ -67,6 +67,7 @@ def run(arguments: Sequence[str]) -> int:
         write_pattern(written, pattern)
         print(f"written: {written}")
     posed, sewn = sew_pattern(pattern, sheet, body, betas, material, angle)
+    sheet, sewn = sewn_open(sheet, sewn, posed, material)
     worn = _garment(pattern, sheet, sewn)
     print("\n".join(_report(pattern, sheet, sewn)))
     if picture is not None:
@@ -165,6 +166,7 @@ def _garment(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> Garment:
         panels=dict(sheet.panels),
         flat=sheet.flat,
         stiffness=sheet.stiffness,
+        fasteners=dict(sheet.rows) or None,
         riders=riders_of(pattern, sheet, sewn.pos),
         **vars(sheet.made),
     )
@@ -180,6 +182,7 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
     ]
     if sewn.held.any():
         lines.append(f"its waist is held, {int(sewn.held.sum())} vertices; pins=none of hood rollout lets it go")
+    lines += [f"{name}: {len(pairs)} pairs; events of hood rollout open it" for name, pairs in sheet.rows.items()]
     if sheet.made.elastic is not None:
         count = int((sheet.made.elastic != 1.0).any(axis=1).sum())
         lines.append(f"elastic in {count} triangles; waist=held holds a waist instead")

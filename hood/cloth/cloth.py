@@ -213,7 +213,6 @@ def build_cloth(
     edge_table, hinge_table = topology.unique_edges(triangles), topology.hinges(triangles)
     edges, hinges = torch.as_tensor(edge_table), torch.as_tensor(hinge_table.vertices)
     area = geometry.triangle_areas(pos, tri)
-    _warn_about_slivers(pos, tri, area)
     fabric = FabricMap(material, len(points), triangles, edge_table, area.numpy(), stiffness)
     density = torch.tensor(fabric.on_faces("density"))
     hinge_edges = topology.edge_index(edge_table, hinge_table.vertices[:, :2])
@@ -239,6 +238,7 @@ def build_cloth(
         if made.elastic is not None:
             shape, real["density"] = made.contracted(shape, density)
         real |= rest_of(shape, tri, hinges, real["density"], len(points))
+    _warn_about_slivers(pos[tri] if flat is None else torch.as_tensor(flat), real["rest_area"], tri)
     if flat is not None:
         real["rest_angle"] = torch.zeros_like(angle) if flat_rest else rest_angles(pos, hinges, hinge_table.faces, flat)
         uv = (flat.reshape(-1, 2), np.arange(flat[..., 0].size).reshape(-1, 3))
@@ -296,9 +296,9 @@ def _pinned_mask(pinned: np.ndarray | None, num_vertices: int) -> Tensor:
     return torch.as_tensor(mask.astype(bool))
 
 
-def _warn_about_slivers(pos: Tensor, faces: Tensor, area: Tensor) -> None:
-    corners = pos[faces]
-    longest_sq = (corners - corners[:, [1, 2, 0]]).square().sum(dim=2).amax(dim=1)
+def _warn_about_slivers(corners: Tensor, area: Tensor, faces: Tensor) -> None:
+    """Warn of the worst face by its corners (F, 3, 2 or 3) at rest; those of NaN are passed over."""
+    longest_sq = (corners - corners[:, [1, 2, 0]]).square().sum(dim=2).amax(dim=1).nan_to_num()
     aspect = 0.5 * longest_sq / area
     worst = int(aspect.argmax())
     if float(aspect[worst]) > _ASPECT_LIMIT:

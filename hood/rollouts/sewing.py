@@ -19,7 +19,10 @@ from torch import Tensor
 
 from hood.assets.files.said import ProgressLines
 from hood.assets.garment.binding import posed_body
+from hood.assets.garment.fasteners import ROOM, with_room
+from hood.assets.garment.garment import Garment
 from hood.assets.motion.sequence_edit import arms_down
+from hood.assets.pattern.fronts import opened
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Obstacle, State, StepInput
@@ -29,6 +32,7 @@ from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.rollouts.sewn import Sewn, joints_of, judged, limbs_in
+from hood.scene.holding import fastening_of
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
@@ -161,7 +165,8 @@ def _has_legs(sheet: PatternSheet, start: SewingStart) -> bool:
 
 
 def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
-    """A mesh of the pattern of about ``count`` vertices, less than half of those of ``sheet``; else that itself."""
+    """A mesh of the pattern of about ``count`` vertices: less than half of those of ``sheet`` or, in the last attempt, more;
+    else that itself."""
     area = 0.5 * float(np.abs(np.linalg.det(sheet.flat[:, 1:] - sheet.flat[:, :1])).sum())
     wide = min(max(math.sqrt(area / count / math.sqrt(0.75)), _LEAST_EDGE), _MOST_EDGE)
     while True:
@@ -170,8 +175,9 @@ def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
         except ValueError:  # a panel is too narrow for such edges
             coarse = None
         if coarse is not None:
-            return coarse if 2 * len(coarse.pos) < len(sheet.pos) else sheet
-        if area / wide**2 > len(sheet.pos):
+            another = 2 * len(coarse.pos) < len(sheet.pos) or (count == _FINER and len(coarse.pos) > len(sheet.pos))
+            return coarse if another else sheet
+        if area / wide**2 > max(len(sheet.pos), count):
             return sheet
         wide *= 0.8
 
@@ -232,6 +238,19 @@ def sewn_finer(coarse: PatternSheet, sewn: Sewn, sheet: PatternSheet, start: Sew
     pos = push_out_of_body(work.cloth, pos, work.body(1.0, 1.0), 2e-3)
     here, resting, speed = work.rest(pos, 1.0 / 30.0)
     return work.sewn(here, sewn.steps + resting, speed)
+
+
+@torch.no_grad()
+def sewn_open(sheet: PatternSheet, sewn: Sewn, posed: PosedBody, material: Material) -> tuple[PatternSheet, Sewn]:
+    """A garment that is opened along what closes it, at rest as that holds it, and its mesh; one without as it is."""
+    if not sheet.fastened or sewn.figures.faults:
+        return sheet, sewn
+    cut, pos, before = opened(sheet, sewn.pos)
+    closed, _ = with_room(Garment("open", pos, cut.faces, sewn.held[before]), cut.rims)
+    work = _Work(cut, SewingStart(posed, posed, sewn.lift, sewn.depth, 1.0), material, closed.pinned)
+    here, resting, speed = work.rest(torch.as_tensor(closed.rest_pos), 1.0 / 30.0)
+    ready = work.sewn(here, sewn.steps + resting, speed)
+    return cut, replace(ready, seconds=sewn.seconds + ready.seconds)
 
 
 def waist_of(sheet: PatternSheet) -> np.ndarray:
@@ -300,13 +319,15 @@ class _Work:
             faces = np.concatenate([faces, squares + len(skin)])
             skin, thin = np.concatenate([skin, points]), np.concatenate([thin, points])
         self.skin, self.thin, self.body_faces = (torch.as_tensor(table) for table in (skin, thin, faces))
+        self.closed, fastening = sheet.closed, fastening_of(sheet.rows, torch.as_tensor(self.begun))
+        self.fastened = fastening and replace(fastening.pairs, length=torch.full_like(fastening.pairs.length, ROOM), speed=None)
         self.progress = ProgressLines("sewing")
         self._growth = start.growth / max(float((self.skin - self.thin).norm(dim=1).max()), 1e-9)
 
     def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
         """What has come of it."""
         start, at = self.start, pos.numpy()
-        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed, start.before)
+        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed, start.before, self.closed)
         return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
 
     def body(self, share: float, later: float) -> Obstacle:
@@ -318,7 +339,7 @@ class _Work:
     def _problem(self, pos: Tensor, dt: float, body: Obstacle, weight: bool) -> StepProblem:
         """One implicit step [s] from rest, with weight and what is held, or without."""
         cloth = replace(self.cloth, pinned=torch.as_tensor(self.held)) if weight else self.cloth
-        step = StepInput(dt=pos.new_full((1,), dt), obstacle=body, pin_target=pos)
+        step = StepInput(dt=pos.new_full((1,), dt), obstacle=body, pin_target=pos, attachments=self.fastened)
         problem = StepProblem(cloth, State(pos, torch.zeros_like(pos), pos.new_zeros(1, 3)), step)
         return problem if weight else replace(problem, gravity=pos.new_zeros(3))
 

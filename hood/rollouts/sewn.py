@@ -118,14 +118,16 @@ def judged(
     held: np.ndarray,
     speed: float,
     before: PosedBody | None = None,
+    closed: np.ndarray | None = None,
 ) -> SewnFigures:
     """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m] on the body ``before``, or on the
-    same; ``held`` (V,) bool."""
+    same; ``held`` (V,) bool. Openings are those of the faces ``closed`` (G, 3), if not of all."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     start, end = cloth.edges.numpy().T
     strain = np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / cloth.rest_length.numpy() - 1.0)
-    openings = find_openings(pos, faces, posed.surface, posed.faces)
+    closed = faces if closed is None else closed
+    openings = find_openings(pos, closed, posed.surface, posed.faces)
     return SewnFigures(
         len(crossings(pos, faces, posed.surface, posed.faces).pairs),
         len(self_crossings(pos, faces)),
@@ -136,7 +138,7 @@ def judged(
         speed,
         float(signed_distances(pos[held], posed.surface, posed.faces).mean()) if held.any() else 0.0,
         float(posed.surface[:, 1].min() - pos[:, 1].min()),
-        _swapped(faces, before or posed, begun, posed, pos),
+        _swapped(closed, before or posed, begun, posed, pos),
     )
 
 
@@ -149,29 +151,31 @@ def joints_of(posed: PosedBody) -> np.ndarray:
 def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     """Which of the trunk, the left and right arm and leg have a bone that passes through the opening with the rim (N, 3) [m].
 
-    Head and neck are of the trunk, and both legs are as good as it. Shoulders beside the trunk are not told: a wide neckline
-    has them in it.
+    Head and neck are of the trunk, and both legs are as good as it, each below its hip or at it. Shoulders beside the trunk are
+    not told: a wide neckline has them in it.
     """
     joints, parents = joints_of(posed), posed.body.parents
     after = np.roll(rim, -1, axis=0)
     middle = rim.mean(axis=0)
     found: set[str] = set()
     near: set[str] = set()
+    hips: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
         limb = _limb(joint)
         if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
-            (near if JOINTS[joint].endswith("shoulder") else found).add(limb)
-    if {"left leg", "right leg"} <= found:
+            (near if JOINTS[joint].endswith("shoulder") else hips if JOINTS[joint].endswith("hip") else found).add(limb)
+    if {"left leg", "right leg"} <= found | hips:
         found = (found - {"left leg", "right leg"}) | {"trunk"}
     return frozenset(found if "trunk" in found else found | near)
 
 
 def _limb(joint: int) -> str | None:
-    """What the bone that ends in a joint belongs to; None: to the hips or the collar."""
+    """What the bone that ends in a joint belongs to; None: to the collar."""
     side, _, name = JOINTS[joint].partition("_")
     if not name:
         return "trunk"
-    kind = {"shoulder": "arm", "elbow": "arm", "wrist": "arm", "knee": "leg", "ankle": "leg", "foot": "leg"}.get(name)
+    kinds = {"arm": ("shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle", "foot")}
+    kind = next((kind for kind, names in kinds.items() if name in names), None)
     return None if kind is None else f"{side} {kind}"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hood.app.settings.compose import options
 from hood.cli.main import main
-from hood.media.exports.clip import clip_of
+from hood.media.exports.sequences import clip_of
 from hood.media.film import Film
 from hood.media.pieces import LOOKS, FabricLook, looks_of, outfit_ranks, part_colour
 from hood.media.renderer.render import GARMENT_COLOR

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from hood.native import build
-from hood.native.build import processor
-from hood.native.prebuilt import Level, flags_for, levels
+from hood.native.build import Level, flags_for, levels, processor
 
 OTHERS = [level for level in levels()[1:] if level.needs <= frozenset(processor().split())]
 

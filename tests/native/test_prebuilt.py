@@ -8,8 +8,7 @@ import pytest
 
 from hood.native import build as native_build
 from hood.native import prebuilt
-from hood.native.build import BuildError, build, find_compiler
-from hood.native.prebuilt import Level
+from hood.native.build import BuildError, Level, build, find_compiler
 
 FLAGS = ("-O0", "-shared", "-fPIC", "-march=native")
 #: Its library tells for which generation it was made.

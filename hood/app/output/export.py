@@ -23,9 +23,8 @@ from hood.assets.files.library import unknown
 from hood.assets.files.said import install
 from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
-from hood.media.exports.clip import PARTS, Clip, clip_of
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd
-from hood.media.exports.sequences import write_obj_sequence, write_ply_sequence, write_point_cache
+from hood.media.exports.sequences import PARTS, Clip, clip_of, write_obj_sequence, write_ply_sequence, write_point_cache
 from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.compact import STORES
 from hood.rollouts.file.reader import RolloutData, read_rollout

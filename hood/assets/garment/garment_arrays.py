@@ -100,7 +100,7 @@ def checked_fields(where: str, arrays: Mapping[str, np.ndarray]) -> dict[str, An
         if key in arrays and (key != "uv_faces" or "uv" in fields):
             fields[key] = _corner_table(where, key, arrays[key], fields)
     if "flat" in arrays:
-        fields["flat"] = _flat(where, arrays["flat"], len(fields["faces"]))
+        fields["flat"] = _flat(where, _spread_flat(where, arrays["flat"], fields), len(fields["faces"]))
     for key in _SIDES:
         if key in arrays:
             fields[key] = _sides(where, key, arrays[key], fields)
@@ -258,6 +258,18 @@ def _panel(where: str, key: str, value: Any, num_faces: int) -> np.ndarray:
     if mask.dtype.kind != "b" or mask.shape != (num_faces,):
         raise ValueError(f"{where}: {key} is {mask.dtype} {mask.shape}; give one bool a face, ({num_faces},)")
     return mask
+
+
+def _spread_flat(where: str, value: Any, fields: Mapping[str, Any]) -> Any:
+    """Corners in the flat pattern; a single true says that the texture coordinates are they, in metres."""
+    array = np.asarray(value)
+    if array.dtype.kind != "b" or array.shape != ():
+        return array
+    if not array:
+        raise ValueError(f"{where}: flat is false; give true where uv are metres of the flat pattern, or leave it out")
+    if "uv_faces" not in fields:
+        raise ValueError(f"{where}: flat is true without uv and uv_faces; write both, or leave flat out")
+    return fields["uv"][fields["uv_faces"]]
 
 
 def _flat(where: str, value: Any, num_faces: int) -> np.ndarray:

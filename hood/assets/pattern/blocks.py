@@ -48,7 +48,7 @@ class Table:
     def __init__(self) -> None:
         self.panels: dict[str, PatternPanel] = {}
         self.stitches: list[Stitch] = []
-        self._keys: dict[str, list[str]] = {}
+        self.sides: dict[str, list[str]] = {}  # keys of the sides of a panel
 
     def draw(self, name: str, outline: Outline, angles: Place = (0, 0, 0), at: Place = (0, 0, 0), label: str = "body") -> None:
         edges = []
@@ -57,11 +57,11 @@ class Table:
             edges.append(Edge(np.array(side.start), np.array(following.start), curve, None, _label(side.key)))
         turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         self.panels[name] = PatternPanel(name, tuple(edges), tuple(range(len(edges))), turn, np.array(at, dtype=float), label)
-        self._keys[name] = [side.key for side in outline]
+        self.sides[name] = [side.key for side in outline]
         self._sew_darts(name)
 
     def _sew_darts(self, name: str) -> None:
-        for key in self._keys[name]:
+        for key in self.sides[name]:
             if key.endswith("dart_a"):
                 self.sew((name, key), (name, key.replace("dart_a", "dart_b")))
 
@@ -74,21 +74,21 @@ class Table:
         ]
         placed = over @ panel.rotation @ over, over @ panel.translation
         self.panels[other] = PatternPanel(other, tuple(edges), panel.numbers, *placed, panel.label)
-        self._keys[other] = self._keys[name][::-1]
+        self.sides[other] = self.sides[name][::-1]
         self._sew_darts(other)
 
     def keys(self, name: str, beginning: str) -> list[SideKey]:
         """The sides of a panel whose keys begin so, from the right of the body to its left for a panel in front, and from its
         left to its right for one behind: as the panel is seen."""
-        panel, found = self.panels[name], [key for key in self._keys[name] if _bare(key).startswith(beginning)]
-        middle = {key: float(panel.edges[self._keys[name].index(key)].at(np.array([0.5]))[0, 0]) for key in found}
+        panel, found = self.panels[name], [key for key in self.sides[name] if _bare(key).startswith(beginning)]
+        middle = {key: float(panel.edges[self.sides[name].index(key)].at(np.array([0.5]))[0, 0]) for key in found}
         return [(name, key) for key in sorted(found, key=lambda key: middle[key])]
 
     def lengths(self, sides: Sequence[SideKey]) -> list[float]:
-        return [self.panels[name].edges[self._keys[name].index(key)].length for name, key in sides]
+        return [self.panels[name].edges[self.sides[name].index(key)].length for name, key in sides]
 
     def sew(self, first: SideKey, second: SideKey, same: bool = False) -> None:
-        ends = [(name, self._keys[name].index(key)) for name, key in (first, second)]
+        ends = [(name, self.sides[name].index(key)) for name, key in (first, second)]
         self.stitches.append(Stitch(ends[0], ends[1], same))
 
     def sew_all(self, first: Sequence[SideKey], second: Sequence[SideKey]) -> None:
@@ -97,8 +97,8 @@ class Table:
 
     def sew_keys(self, first: str, second: str, beginnings: Sequence[str]) -> None:
         """Two panels along every side whose keys begin so and are in both."""
-        for key in self._keys[first]:
-            if _bare(key).startswith(tuple(beginnings)) and key in self._keys[second]:
+        for key in self.sides[first]:
+            if _bare(key).startswith(tuple(beginnings)) and key in self.sides[second]:
                 self.sew((first, key), (second, key))
 
 

@@ -8,7 +8,9 @@ file, angles in degrees; other programs pass it over:
   counter-clockwise; ``"bending"`` of a fold is a factor on the stiffness there;
 - an edge: ``"hood": {"elastic": 0.85, "bending": 3, "width": 2}``, the same of the cloth within a width of it, such as a hem;
 - a side of a stitch: ``{"panel": "cuff", "edge": 0, "hood": {"angle": 150, "bending": 4}}``, the angle of a seam as its first
-  panel sees it, and how stiff its layers are.
+  panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons so far
+  from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches 3 below
+  the first.
 """
 
 from __future__ import annotations
@@ -25,15 +27,15 @@ from hood.mesh import topology
 from hood.mesh.flat import Construction, stretched_sides
 
 if TYPE_CHECKING:
-    from hood.assets.pattern.pattern import Pattern
+    from hood.assets.pattern.pattern import Pattern, PatternPanel, Stitch
     from hood.assets.pattern.sheet import PatternSheet
 
 #: What elastic and the stiffness of seams may be [factors], and how wide [m] a hem or a band of elastic is that does not say.
 ELASTIC, _STIFF, _HEM = (0.2, 2.0), (0.01, 1000.0), 0.02
 #: The layers of a seam reach so far [m] on either side of it.
 _ALLOWANCE = 0.01
-#: A fold is at least so long [m].
-_SHORTEST = 1e-4
+#: A fold is at least so long [m]; what is said of a fastener, and its least [m].
+_SHORTEST, _OF_FASTENER, _NEAREST = 1e-4, ("every", "overlap"), 5e-3
 #: What a panel says of what rides on it, which :mod:`hood.assets.pattern.riding` reads.
 _RIDING = ("patches", "buttons", "radius")
 #: Points of a side that tell how much of it is in a band, and points of an edge of the line that the band follows.
@@ -63,6 +65,16 @@ class EdgeMaking:
     width: float = _HEM
 
 
+@dataclass(frozen=True)
+class Fastener:
+    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres; of 0 a zip,
+    all of them. The second one reaches ``overlap`` [m] below the first."""
+
+    row: str
+    every: float = 0.0
+    overlap: float = 0.0
+
+
 def panel_making(where: str, own: Mapping[str, Any], scale: float) -> tuple[tuple[float, float], tuple[Fold, ...]]:
     """Elastic along x and y of a panel, and its folds; ``scale`` [m] is the unit of its lengths.
 
@@ -90,11 +102,57 @@ def edge_making(where: str, own: Mapping[str, Any], scale: float) -> EdgeMaking:
     return EdgeMaking(elastic, _factor(where, "bending", made.get("bending", 1.0), _STIFF), width)
 
 
-def stitch_making(where: str, first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[float | None, float]:
-    """The angle [rad] of a seam, None where no side says one, and its factor on the stiffness in bending."""
-    made = _made(where, second, ("angle", "bending")) | _made(where, first, ("angle", "bending"))
+def stitch_making(
+    where: str, first: Mapping[str, Any], second: Mapping[str, Any], scale: float
+) -> tuple[float | None, float, Fastener | None]:
+    """The angle [rad] of a seam, None where no side says one, its factor on the stiffness in bending, and what closes it."""
+    known = ("angle", "bending", "fastener", *_OF_FASTENER)
+    made = _made(where, second, known) | _made(where, first, known)
     angle = _angle(where, made["angle"]) if "angle" in made else None
-    return angle, _factor(where, "bending", made.get("bending", 1.0), _STIFF)
+    bending, row, fastener = _factor(where, "bending", made.get("bending", 1.0), _STIFF), made.get("fastener"), None
+    for key in _OF_FASTENER if row is None else ():
+        if key in made:
+            raise ValueError(f"{where}: hood.{key} is {made[key]!r} without a fastener; name its row, fastener: front_buttons")
+    if row is not None:
+        if not (isinstance(row, str) and row.isidentifier()):
+            raise ValueError(f"{where}: hood.fastener is {row!r}; give the name of a row, such as front_buttons or front_zip")
+        limits = _NEAREST / scale, 1.0 / scale
+        own = {key: scale * _factor(where, key, made[key], limits) for key in _OF_FASTENER if key in made}
+        fastener = Fastener(row, **own)
+    return angle, bending, fastener
+
+
+def written_panel(panel: PatternPanel) -> dict[str, Any]:
+    """The key ``hood`` of a panel in a file in centimetres, as :func:`panel_making` reads it; empty where there is none. So do
+    the next two."""
+    own: dict[str, Any] = {} if panel.elastic == (1.0, 1.0) else {"elastic": list(panel.elastic)}
+    if panel.folds:
+        own["folds"] = [
+            {
+                "from": [round(100.0 * float(x), 10) for x in fold.start],
+                "to": [round(100.0 * float(x), 10) for x in fold.end],
+                "angle": float(np.degrees(fold.angle)),
+                "bending": fold.bending,
+            }
+            for fold in panel.folds
+        ]
+    return {"hood": own} if own else {}
+
+
+def written_edge(making: EdgeMaking) -> dict[str, Any]:
+    own = {"elastic": making.elastic, "bending": making.bending, "width": round(100.0 * making.width, 10)}
+    return {} if making == EdgeMaking() else {"hood": own}
+
+
+def written_stitch(stitch: Stitch) -> dict[str, Any]:
+    own: dict[str, Any] = {} if stitch.angle is None else {"angle": float(np.degrees(stitch.angle))}
+    if stitch.bending != 1.0:
+        own["bending"] = stitch.bending
+    if stitch.fastener is not None:
+        own["fastener"] = stitch.fastener.row
+        lengths = {key: round(100.0 * getattr(stitch.fastener, key), 10) for key in _OF_FASTENER}
+        own |= {key: length for key, length in lengths.items() if length}
+    return {"hood": own} if own else {}
 
 
 def _made(where: str, own: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
@@ -209,7 +267,7 @@ def laid(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
         outer: 1, or -1 for a panel whose outer side is at negative z.
     """
     flat = np.pad(points, ((0, 0), (0, 1)))
-    if len(folds) < 2:
+    if len({fold.angle > 0.0 for fold in folds}) < 2:
         return flat
     ways = [fold.end - fold.start for fold in folds]
     ways = [way / np.linalg.norm(way) * np.sign(way @ ways[0]) for way in ways]

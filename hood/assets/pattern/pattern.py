@@ -21,7 +21,17 @@ from scipy.spatial.transform import Rotation
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
-from hood.assets.pattern.making import EdgeMaking, Fold, edge_making, panel_making, stitch_making
+from hood.assets.pattern.making import (
+    EdgeMaking,
+    Fastener,
+    Fold,
+    edge_making,
+    panel_making,
+    stitch_making,
+    written_edge,
+    written_panel,
+    written_stitch,
+)
 from hood.assets.pattern.riding import Patch, patches_of, written_patches
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
@@ -126,13 +136,14 @@ class PatternPanel:
 class Stitch:
     """Two edges, as (panel, place in its loop), that are sewn; ``same``: they run in one direction, not against each other.
     The cloth is folded there by ``angle`` [rad], seen from the first, where that is not None, and bends ``bending`` times as
-    stiffly."""
+    stiffly. With a ``fastener`` it is opened once it is sewn, and closed by that."""
 
     first: tuple[str, int]
     second: tuple[str, int]
     same: bool = False
     angle: float | None = None
     bending: float = 1.0
+    fastener: Fastener | None = None
 
 
 @dataclass(frozen=True)
@@ -179,7 +190,7 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     stitches = table.get("stitches", [])
     if not isinstance(stitches, list):
         raise ValueError(f"{path}: pattern.stitches is no list; write [[{{panel, edge}}, {{panel, edge}}], …]")
-    found = tuple(_stitch(f"{path}: stitch {number}", own, panels) for number, own in enumerate(stitches))
+    found = tuple(_stitch(f"{path}: stitch {number}", own, panels, 1.0 / units) for number, own in enumerate(stitches))
     height = float(_numbers(f"{path}: properties.body_height", properties.get("body_height", BODY_HEIGHT * units), ())) / units
     if not 0.3 <= height <= 3.0:
         raise ValueError(f"{path}: properties.body_height is {height:g} m; give the height of the body, in the file's unit")
@@ -290,7 +301,7 @@ def _check_outline(where: str, edges: list[Edge], numbers: list[int]) -> None:
         raise ValueError(f"{where}: its outline crosses itself, edge {first} and edge {second}; move their vertices apart")
 
 
-def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel]) -> Stitch:
+def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel], scale: float) -> Stitch:
     if not isinstance(own, list) or len(own) not in (2, 3) or not all(isinstance(side, dict) for side in own[:2]):
         raise ValueError(f"{where} is no pair of sides; write [{{panel, edge}}, {{panel, edge}}]")
     if len(own) == 3 and own[2] != "right_wrong":
@@ -306,7 +317,7 @@ def _stitch(where: str, own: Any, panels: Mapping[str, PatternPanel]) -> Stitch:
                 f"{where}: panel {name!r} has no edge {number}; remove the stitch, or give one of 0 to {count - 1}"
             )
         sides.append((str(name), panels[name].numbers.index(number)))
-    return Stitch(sides[0], sides[1], len(own) == 3, *stitch_making(where, own[0], own[1]))
+    return Stitch(sides[0], sides[1], len(own) == 3, *stitch_making(where, own[0], own[1], scale))
 
 
 def _check_stitches(where: str, pattern: Pattern, most: float) -> None:
@@ -345,17 +356,10 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     Edges stand in the order of the loop; an existing file is replaced at once or not at all.
 
     Raises:
-        ValueError: an edge whose curve has more than two control points, which the format has not; what the key ``hood`` says,
-            which is read and not written.
+        ValueError: an edge whose curve has more than two control points, which the format has not.
     """
     panels: dict[str, dict[str, Any]] = {}
-    if any(stitch.angle is not None or stitch.bending != 1.0 for stitch in pattern.stitches):
-        raise ValueError(f"{path}: angles and stiffness of seams are not written; write the stitches' key hood into the file")
     for name, panel in pattern.panels.items():
-        if panel.elastic != (1.0, 1.0) or panel.folds or any(edge.making != EdgeMaking() for edge in panel.edges):
-            raise ValueError(
-                f"{path}: panel {name!r}: elastic, folds and hems are not written; write its key hood into the file"
-            )
         edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of turns for which several triples of angles stand
@@ -366,12 +370,14 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
             "vertices": [_rounded(100.0 * edge.start) for edge in panel.edges],
             "edges": edges,
             "label": panel.label,
+            **written_panel(panel),
         }
         if panel.patches:
             panels[name]["hood"] = panels[name].get("hood", {}) | written_patches(panel)
     stitches: list[list[Any]] = []
     for stitch in pattern.stitches:
         sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
+        sides[0] |= written_stitch(stitch)
         stitches.append([*sides, "right_wrong"] if stitch.same else sides)
     properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
     properties["body_height"] = round(100.0 * pattern.height, 10)
@@ -390,7 +396,7 @@ def _rounded(values: np.ndarray) -> list[float]:
 
 
 def _written(where: str, number: int, count: int, edge: Edge) -> dict[str, Any]:
-    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count]}
+    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count], **written_edge(edge.making)}
     if edge.arc is not None:
         radius, large, right = edge.arc
         content["curvature"] = {"type": "circle", "params": [100.0 * radius, int(large), int(right)]}

@@ -28,6 +28,8 @@ _CLOTH, _HIGHER, _BUTTON = 1.5e-3, 5e-4, 3.5e-3
 _STEP, _FOOT = 8e-3, 0.1
 #: Less than this [m²] is no triangle.
 _NO_AREA = 1e-9
+#: Pairs of points and triangles that are looked at at once.
+_AT_ONCE = 1 << 21
 #: What a button measures that does not say [m], and the corners of its outline.
 _RADIUS, _CORNERS = 9e-3, 16
 
@@ -119,14 +121,14 @@ def _rider(
     rows = np.unique(sheet.uv_faces[own])
     start = sheet.uv[rows[sheet.outline[rows] == 0.0][0]]
     ring = _divided(patch.outline + start - panel.edges[0].start)
-    inner = sheet.uv[rows][_inside(sheet.uv[rows], ring)]
+    inner = sheet.uv[rows][inside(sheet.uv[rows], ring)]
     inner = inner[cKDTree(ring).query(inner)[0] > 0.5 * _STEP] if len(inner) and not patch.rigid else inner[:0]
     points = np.concatenate([ring, inner])
     triangles = Delaunay(points).simplices.astype(np.int64)
     area = np.linalg.det(points[triangles][:, 1:] - points[triangles][:, :1])
-    whole = _inside(points[triangles].mean(axis=1), ring) & (np.abs(area) > _NO_AREA)
+    whole = inside(points[triangles].mean(axis=1), ring) & (np.abs(area) > _NO_AREA)
     triangles, area = triangles[whole], area[whole]
-    face, bary = sheet.located(points, own)
+    face, bary = in_triangles(points, flat)
     # Wound as the cloth beneath; and the ring as the triangles.
     outer = np.sign(np.linalg.det(flat[:, 1:] - flat[:, :1]).sum())
     triangles[area * outer < 0] = triangles[area * outer < 0][:, ::-1]
@@ -155,9 +157,27 @@ def _divided(outline: np.ndarray) -> np.ndarray:
     return np.concatenate(pieces)
 
 
-def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 2) that a closed outline turns around."""
-    ways = outline - points[:, None]
-    seen = ways[..., 0] + 1j * ways[..., 1]
-    turn = np.angle(np.roll(seen, -1, axis=1) * seen.conj()).sum(axis=1)
-    return np.asarray(np.abs(turn) > np.pi)
+def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
+    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
+    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
+        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
+        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
+        face[rows] = bary.min(axis=2).argmax(axis=1)
+        weights[rows] = bary[np.arange(len(rows)), face[rows]]
+    weights = weights.clip(min=0.0)
+    return face, weights / weights.sum(axis=1, keepdims=True)
+
+
+def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
+    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
+    u, v = following.T
+    result = np.zeros(len(points), dtype=bool)
+    for k in range(len(outline)):
+        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
+        if crossed.any():
+            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
+            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
+    return result

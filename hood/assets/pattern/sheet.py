@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.making import construction_of, laid
+from hood.assets.pattern.making import Fastener, construction_of, laid
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
+from hood.assets.pattern.riding import in_triangles, inside
 from hood.mesh import topology
 from hood.mesh.flat import Construction
 
@@ -23,8 +24,10 @@ _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 _HALVED = 5
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
-#: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
-_CURVED, _AT_ONCE = 32, 1 << 21
+#: Points of a curve that tell how far it reaches.
+_CURVED = 32
+#: No pairs.
+_NONE = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,10 @@ class PatternSheet:
         height: m, of the body around which the panels are placed.
         made: its elastic, its folds and how stiff its seams and hems are.
         stiffness: (V,) how many times as stiff as the fabric the cloth is; None: once.
+        joins: (J, 2) points of ``uv`` that seams join.
+        fastened: seams that are to be opened: what closes them, and their points (N, 2) of ``uv``.
+        rows: of an opened sheet, (P, 2) vertices by name that close it; ``rims`` (N, 2) are all that face each other there, and
+            ``closed`` (G, 3) faces as if each of these were one.
     """
 
     pos: np.ndarray
@@ -56,6 +63,11 @@ class PatternSheet:
     height: float = BODY_HEIGHT
     made: Construction = Construction()
     stiffness: np.ndarray | None = None
+    joins: np.ndarray = field(default_factory=lambda: _NONE)
+    fastened: tuple[tuple[Fastener, np.ndarray], ...] = ()
+    rows: Mapping[str, np.ndarray] = field(default_factory=dict)
+    rims: np.ndarray = field(default_factory=lambda: _NONE)
+    closed: np.ndarray | None = None
 
     @property
     def flat(self) -> np.ndarray:
@@ -69,10 +81,6 @@ class PatternSheet:
         if self.made.elastic is not None:
             found[self.faces[(self.made.elastic != 1.0).any(axis=1)]] = True
         return found
-
-    def located(self, points: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the faces ``own`` (F,) bool points (N, 2) of ``uv`` lie in, (N,), and the weights (N, 3) of its corners."""
-        return _in_triangles(points, self.flat[own])
 
     @property
     def welds(self) -> np.ndarray:
@@ -117,11 +125,16 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         owner.append(np.full(len(triangles), number))
         start += len(points)
     pos, corners, of_panel = np.concatenate(placed), np.concatenate(faces), np.concatenate(owner)
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    pairs, fastened = [_NONE], []
     for stitch in pattern.stitches:
         first, second = outlines[stitch.first], outlines[stitch.second]
-        pairs.append(np.stack([first, second if stitch.same else second[::-1]], axis=1))
-    joined = np.concatenate(pairs)
+        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
+        if stitch.fastener is None:
+            pairs.append(pair)
+        else:
+            fastened.append((stitch.fastener, pair))
+    joins = np.concatenate(pairs)
+    joined = np.concatenate([joins, *(pair for _, pair in fastened)])
     label = topology.connected_components(start, joined)
     _, welds = np.unique(label, return_inverse=True)
     count = np.bincount(welds)
@@ -139,9 +152,10 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         marks[name] = np.zeros(len(count), dtype=bool)
         marks[name][welds[np.concatenate(sides)]] = True
     parts = {name: of_panel == index for index, name in enumerate(names)}
-    return PatternSheet(
+    sewn = PatternSheet(
         middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
     )
+    return replace(sewn, joins=joins, fastened=tuple(fastened))
 
 
 def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
@@ -170,7 +184,7 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
             distance, nearest = cKDTree(fine.uv[rim]).query(fine.uv[inner])
             reach = np.sqrt(np.abs(np.linalg.det(coarse.uv[own][:, 1:] - coarse.uv[own][:, :1])).mean())
             share = np.clip(1.0 - distance / reach, 0.0, 1.0)
-            face, bary = _in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
+            face, bary = in_triangles(fine.uv[inner] + share[:, None] * shift[nearest], coarse.uv[own])
             found[~on_rim] = np.einsum("nk,nkx->nx", bary, at[own[face]])
         np.add.at(total, welds[rows], found)
         np.add.at(count, welds[rows], 1.0)
@@ -180,19 +194,6 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
 def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """``values`` (K, n) at the places ``way`` (K,), read between them (N, n)."""
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
-
-
-def _in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
-    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
-        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
-        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
-        face[rows] = bary.min(axis=2).argmax(axis=1)
-        weights[rows] = bary[np.arange(len(rows)), face[rows]]
-    weights = weights.clip(min=0.0)
-    return face, weights / weights.sum(axis=1, keepdims=True)
 
 
 #: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.
@@ -247,13 +248,23 @@ def _divisions(
         least[first] = least[second] = 2 if first[0] == second[0] else 1
     found = {}
     for key, shares in at.items():
-        steps = np.unique(np.round(sorted(shares), 9))
+        steps = _apart(shares, _AT_CORNER * edge / lengths[key])
         parts = np.maximum(
             np.round(np.diff(steps) * lengths[key] / edge).astype(np.int64), least[key] if len(steps) == 2 else 1
         )
         inner = [np.linspace(low, high, n + 1)[:-1] for low, high, n in zip(steps[:-1], steps[1:], parts, strict=True)]
         found[key] = np.append(np.concatenate(inner), 1.0)
     return found
+
+
+def _apart(shares: set[float], least: float) -> np.ndarray:
+    """Shares of a side in their order; those nearer to each other than ``least`` are one, as ends of folds on both sides of a
+    stitch are."""
+    steps = np.unique(np.round(sorted(shares), 9))
+    group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
+    middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]
+    middle[0], middle[-1] = 0.0, 1.0
+    return np.asarray(middle)
 
 
 def _meshed(
@@ -266,7 +277,7 @@ def _meshed(
     first = np.cumsum([0, *(len(line) for line in lines)])
     sides = [np.arange(first[k], first[k + 1] + 1) % len(outline) for k in range(len(lines))]
     points, creases = _creased(panel, outline, sides, shares, ends, edge, where)
-    inner = _grid_inside(outline, edge)
+    inner = _gridinside(outline, edge)
     if len(creases) and len(inner):
         dense = np.concatenate([_dense(points[line], edge) for line in creases])
         inner = inner[cKDTree(dense).query(inner)[0] > _FROM_OUTLINE * edge]
@@ -275,7 +286,7 @@ def _meshed(
     triangles = np.zeros((0, 3), dtype=np.int64)
     if len(outline) >= 3:
         triangles = Delaunay(points).simplices.astype(np.int64)
-        triangles = triangles[_inside(points[triangles].mean(axis=1), outline)]
+        triangles = triangles[inside(points[triangles].mean(axis=1), outline)]
         corners = points[triangles]
         area = np.linalg.det(corners[:, 1:] - corners[:, :1])
         triangles = triangles[np.abs(area) > 1e-6 * edge * edge]
@@ -321,7 +332,7 @@ def _creased(
         tips = []
         for place, end in zip(places, (fold.start, fold.end), strict=True):
             if place is None:
-                if not _inside(end[None], outline)[0]:
+                if not inside(end[None], outline)[0]:
                     x, y = 1e2 * end
                     raise ValueError(
                         f"{where}: panel {panel.name!r}: the end ({x:.1f}, {y:.1f}) cm of a fold is outside; move it"
@@ -361,7 +372,7 @@ def _signed_area(outline: np.ndarray) -> float:
     return 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
 
 
-def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
+def _gridinside(outline: np.ndarray, edge: float) -> np.ndarray:
     """Points (N, 2) of a triangular grid inside an outline, not too near to it."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     rise = edge * np.sqrt(0.75)
@@ -369,7 +380,7 @@ def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
     columns = np.arange(low[0] + 0.25 * edge, high[0], edge)
     x = columns[None] + 0.5 * edge * (np.arange(len(rows))[:, None] % 2)
     points = np.stack([x, np.broadcast_to(rows[:, None], x.shape)], axis=-1).reshape(-1, 2)
-    points = points[_inside(points, outline)] if len(points) else points
+    points = points[inside(points, outline)] if len(points) else points
     if not len(points):
         return np.zeros((0, 2))
     nearest, _ = cKDTree(_dense(outline, edge)).query(points)
@@ -382,19 +393,6 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     count = max(int(np.ceil(4.0 * np.linalg.norm(following - outline, axis=1).max() / edge)), 1)
     share = np.arange(count)[:, None, None] / count
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
-
-
-def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
-    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
-    u, v = following.T
-    result = np.zeros(len(points), dtype=bool)
-    for k in range(len(outline)):
-        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
-        if crossed.any():
-            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
-            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
-    return result
 
 
 def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, names: list[str], where: str) -> None:

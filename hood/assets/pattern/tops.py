@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from hood.assets.pattern.blocks import (
     Leg,
     Neck,
@@ -21,6 +23,7 @@ from hood.assets.pattern.blocks import (
     upper_half,
 )
 from hood.assets.pattern.bottoms import gore_waist, gores, leg_waist
+from hood.assets.pattern.fronts import lapels, open_front, quilted, ribbed, stand, turned_collar
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.options import Choices, Design, Options, entered
 
@@ -67,19 +70,6 @@ def _tshirt(t: Table, m: Measures, o: Options) -> None:
     _sleeved(t, m, o)
 
 
-def _collar(t: Table, m: Measures, height: float) -> None:
-    """A stand of two strips on the neckline."""
-    for back in (False, True):
-        name = "back" if back else "front"
-        below = t.keys(name, "neck")
-        lengths = t.lengths(below)
-        angles, at = trunk_place(m, back)
-        shift = (at[0], at[1], m.shoulder[2] + (-0.1 if back else 0.1))
-        draw_strip(t, f"collar_{name}", lengths, lengths, height, m.neck_height, (angles, shift))
-        t.sew_all(below, t.keys(f"collar_{name}", "below"))
-    t.sew_keys("collar_front", "collar_back", ["side"])
-
-
 @entered(
     TOPS,
     ease=(0.14, 0.05, 0.5),
@@ -95,7 +85,93 @@ def _shirt(t: Table, m: Measures, o: Options) -> None:
     torso(t, m, o.ease, o.length, Neck(o.depth, 0.04), o.fit)
     sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff if o.cuff >= 0.02 else 0.0)
     if o.collar == "stand":
-        _collar(t, m, 0.035)
+        stand(t, m, 0.035)
+
+
+@entered(
+    TOPS,
+    ease=(0.12, 0.05, 0.5),
+    length=(0.26, 0.1, 0.6),
+    sleeve=(0.97, 0.4, 1.0),
+    wide=(1.15, 0.8, 1.8),
+    cuff=(0.06, 0.0, 0.1),
+    collar=("turned", "stand", "none"),
+    front=("buttons", "zip", "closed"),
+    depth=(0.2, 0.12, 0.3),
+    fit=(0.4, 0.0, 1.0),
+)
+def _blouse(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.04), o.fit)
+    sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff if o.cuff >= 0.02 else 0.0)
+    if o.collar == "stand":
+        stand(t, m, 0.035)
+    elif o.collar == "turned":
+        turned_collar(t, m, 0.03, 0.045, 0.07)
+    open_front(t, o.front, *(["collar_front"] if o.collar != "none" else []), "front")
+
+
+@entered(
+    TOPS,
+    ease=(0.25, 0.12, 0.5),
+    length=(0.1, 0.0, 0.3),
+    sleeve=(0.97, 0.4, 1.0),
+    wide=(1.15, 0.9, 1.5),
+    cuff=(0.06, 0.03, 0.1),
+    band=(0.06, 0.03, 0.1),
+    rib=(0.95, 0.8, 1.1),
+    front=("zip", "buttons", "closed"),
+    depth=(0.18, 0.12, 0.3),
+)
+def _bomber(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.06))
+    sleeves(t, m, o.ease, o.sleeve, o.wide, 1.01, o.cuff)
+    stand(t, m, 0.045)
+    hem = m.waist_height * (1.0 - o.length)
+    for back in (False, True):
+        name = "back" if back else "front"
+        cut = [length / 1.1 for length in t.lengths(t.keys(name, "hem"))]
+        draw_strip(t, f"band_{name}", cut, cut, o.band, hem - o.band, trunk_place(m, back))
+        t.sew_all(t.keys(name, "hem"), t.keys(f"band_{name}", "above"))
+    t.sew_keys("band_front", "band_back", ["side"])
+    around = np.interp(hem - 0.5 * o.band, [m.hip_height, m.waist_height], [m.hips, m.waist])
+    ribbed(t, o.rib * around / (4.0 * cut[0]), "band_front", "band_back")
+    ribbed(t, 0.82 * o.rib, *(f"{side}_cuff_{name}" for side in ("left", "right") for name in ("front", "back")))
+    ribbed(t, 0.9, "collar_front", "collar_back")
+    open_front(t, o.front, "collar_front", "front", "band_front")
+
+
+@entered(
+    TOPS,
+    ease=(0.25, 0.12, 0.5),
+    length=(0.22, 0.08, 0.4),
+    tube=(0.08, 0.06, 0.2),
+    strap=(0.95, 0.8, 1.0),
+    front=("zip", "buttons", "closed"),
+    depth=(0.18, 0.12, 0.3),
+)
+def _gilet(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.06, o.strap))
+    stand(t, m, 0.055)
+    open_front(t, o.front, "collar_front", "front")
+    quilted(t, o.tube, *(name for name in t.panels if "collar" not in name))
+
+
+@entered(
+    TOPS,
+    ease=(0.18, 0.1, 0.5),
+    length=(0.3, 0.12, 0.7),
+    sleeve=(0.97, 0.6, 1.0),
+    wide=(1.05, 0.9, 1.4),
+    lapel=(0.085, 0.06, 0.11),
+    front=("buttons", "closed"),
+    depth=(0.8, 0.55, 0.95),
+    fit=(0.4, 0.0, 1.0),
+)
+def _blazer(t: Table, m: Measures, o: Options) -> None:
+    torso(t, m, o.ease, o.length, Neck(o.depth, 0.06, 1.0, "v"), o.fit)
+    sleeves(t, m, o.ease, o.sleeve, o.wide)
+    lapels(t, m, o.lapel, 0.045)
+    open_front(t, o.front, "front", every=0.1)
 
 
 @entered(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hood.assets.formats.image import Texture
-from hood.media.exports.clip import Clip, ClipPart
+from hood.media.exports.sequences import Clip, ClipPart
 from hood.media.pieces import split_seams
 
 #: Larger files [bytes] are refused: browsers and game engines keep all morph targets in memory.

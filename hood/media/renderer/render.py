@@ -52,6 +52,10 @@ _EDGE_WIDTH, _EDGE_SHADE = 0.0025, 0.3  # m, share of the colour taken
 _SEAM_AT, _SEAM_HALF_WIDTH, _SEAM_SHADE = 0.02, 0.0015, 0.35
 
 
+#: Ways along edges of triangles are longer than straight ones by less than this factor.
+_DETOUR = 1.5
+
+
 def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     """Distance [m] of every vertex from the next open edge of its surface, (V,); :data:`FAR` where none is near.
 
@@ -75,7 +79,9 @@ def hem_distance(pos: ArrayLike, faces: ArrayLike) -> _Array:
     for own in np.unique(part[open_edges[:, 0]]):
         start, end = points[open_edges[part[open_edges[:, 0]] == own].T]
         rows = near & (part == own)
-        result[rows], _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points[rows])
+        dist, _ = cKDTree((start + share * (end - start)).reshape(-1, 3)).query(points[rows])
+        # A layer below has an edge, too, which is nearer than along the surface.
+        result[rows] = np.where(along[rows] > _DETOUR * dist, along[rows], dist)
     return result
 
 

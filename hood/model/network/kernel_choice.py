@@ -25,8 +25,7 @@ from hood.model.kernels import block
 from hood.model.kernels import network as compiled_network
 from hood.model.kernels.block import KERNELS, check_kernels
 from hood.model.network.model import MeshGraphNet
-from hood.native.build import BuildError, cache_folder, find_compiler, processor
-from hood.native.prebuilt import source_text
+from hood.native.build import BuildError, cache_folder, find_compiler, processor, source_text
 from hood.tensors import dense
 from hood.tensors.precision import PRECISIONS
 

@@ -14,7 +14,7 @@ from hood.assets.garment.garment import Garment, save_garment
 from hood.assets.motion.animated_mesh import load_mesh_sequence
 from hood.cli.inspect.findings import inspect_rollout
 from hood.cli.main import main
-from hood.media.exports.clip import clip_of
+from hood.media.exports.sequences import clip_of
 from hood.media.film import seconds_per_frame
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.scene.body_motion.load import MotionOptions, load_motion

@@ -18,7 +18,7 @@ from hood.cli.inspect.findings import inspect_rollout
 from hood.cli.main import main
 from hood.cloth.state import State
 from hood.media.colouring import colouring_of, vertex_strain
-from hood.media.exports.clip import clip_of
+from hood.media.exports.sequences import clip_of
 from hood.mesh.editing.subdivision import Subdivision
 from hood.mesh.penetration.crossing import self_crossings
 from hood.mesh.topology import unique_edges

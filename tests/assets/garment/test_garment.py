@@ -55,6 +55,19 @@ def test_npz_round_trip(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
     np.testing.assert_array_equal(garment.faces, arrays["faces"])
 
 
+def test_texture_coordinates_may_be_the_flat_pattern(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
+    uv = 1.1 * arrays["rest_pos"][:, [0, 2]]
+    tables = {**arrays, "uv": uv, "uv_faces": arrays["faces"]}
+    np.savez(tmp_path / "rag.npz", **tables, flat=True)
+    np.testing.assert_array_equal(load_garment(tmp_path / "rag.npz").flat, uv.astype(np.float64)[arrays["faces"]])
+    np.savez(tmp_path / "rag.npz", **tables, flat=False)
+    with pytest.raises(ValueError, match="flat is false; give true"):
+        load_garment(tmp_path / "rag.npz")
+    np.savez(tmp_path / "rag.npz", **arrays, flat=True)
+    with pytest.raises(ValueError, match="without uv and uv_faces"):
+        load_garment(tmp_path / "rag.npz")
+
+
 def test_mesh_file(tmp_path: Path) -> None:
     pos, faces = cylinder(6, 3)
     lines = [f"v {x} {y} {z}" for x, y, z in pos] + [f"f {a} {b} {c}" for a, b, c in faces + 1]

@@ -18,7 +18,7 @@ from hood.mesh import topology
 
 #: Openings of every design without sleeves; sleeves change none of them.
 OPENINGS = {
-    **dict.fromkeys(("tank", "tshirt", "shirt", "bodice", "sheath", "dress", "swing", "shift"), 4),
+    **dict.fromkeys(("tank", "tshirt", "shirt", "blouse", "bodice", "sheath", "dress", "swing", "shift"), 4),
     **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "wrap", "poncho", "cape"), 2),
     **dict.fromkeys(("trousers", "leggings", "shorts", "jeans", "apron"), 3),
     "hoodie": 4,

@@ -9,8 +9,7 @@ import numpy as np
 
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import Garment
-from hood.media.exports.clip import corner_normals
-from hood.media.exports.sequences import write_obj
+from hood.media.exports.sequences import corner_normals, write_obj
 from hood.testing import box, sphere
 
 

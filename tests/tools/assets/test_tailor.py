@@ -11,7 +11,7 @@ from tools.assets.patterns import PATTERNS
 from tools.assets.tailor import firmness
 
 
-@pytest.mark.parametrize("name", names("garments"))
+@pytest.mark.parametrize("name", [name for name in names("garments") if name.split("_")[0] in PATTERNS])
 def test_bindings_and_linings_are_stiffer(name: str) -> None:
     with np.load(DATA_FOLDER / "garments" / f"{name}.npz", allow_pickle=False) as archive:
         arrays = {key: archive[key] for key in archive.files}

@@ -11,8 +11,7 @@ from hood.assets.files.said import Doubt
 from hood.assets.files.text import flat
 from hood.assets.motion.layouts.content import CAMERA_TRANSL, WORLD_TRANSL, Unread, counts_of
 from hood.assets.motion.layouts.foreign import are_weights, is_like_motion, unknown_motion, unplaced
-from hood.assets.motion.layouts.frames import gather_frames
-from hood.assets.motion.layouts.people import Person, find_people
+from hood.assets.motion.layouts.people import Person, find_people, gather_frames
 from hood.assets.motion.layouts.rotations import TRANSPOSED, Turns, as_turns, to_vectors
 from hood.assets.motion.skeleton import slerp
 
