@@ -17,7 +17,8 @@ from hood.assets.pattern.blocks import XY, Place, Side, SideKey, Table, both_hal
 from hood.assets.pattern.making import EdgeMaking, Fastener, Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import Edge, Stitch
-from hood.assets.pattern.sheet import PatternSheet, in_triangles
+from hood.assets.pattern.riding import in_triangles
+from hood.assets.pattern.sheet import PatternSheet
 from hood.mesh import geometry, topology
 from hood.mesh.flat import SIDE_TABLES, Construction
 

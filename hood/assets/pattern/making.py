@@ -259,7 +259,7 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
     return replace(drawn, stiffness=np.where(drawn.gathered, stiffness, 1.0))
 
 
-def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
+def laid(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
     """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not cross; without, flat.
 
     Args:
@@ -278,7 +278,7 @@ def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarra
         return flat
     beyond = np.stack([(points - fold.start) @ side for fold, side in zip(folds, across, strict=True)], axis=1) > 0.0
     order = np.argsort([fold.start @ across[0] for fold in folds])
-    laid, turn, shift = flat.copy(), np.eye(3), np.zeros(3)
+    found, turn, shift = flat.copy(), np.eye(3), np.zeros(3)
     for row in order:
         # What lies beyond a fold turns around it, with all folds before.
         own, start = (
@@ -287,10 +287,10 @@ def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarra
         )
         shift = turn @ (start - own.apply(start)) + shift
         turn = turn @ own.as_matrix()
-        laid[beyond[:, row]] = flat[beyond[:, row]] @ turn.T + shift
-    middles = flat.mean(axis=0), laid.mean(axis=0)
-    back = Rotation.align_vectors(flat - middles[0], laid - middles[1])[0]
-    return np.asarray(back.apply(laid - middles[1]) + middles[0])
+        found[beyond[:, row]] = flat[beyond[:, row]] @ turn.T + shift
+    middles = flat.mean(axis=0), found.mean(axis=0)
+    back = Rotation.align_vectors(flat - middles[0], found - middles[1])[0]
+    return np.asarray(back.apply(found - middles[1]) + middles[0])
 
 
 def sides_between(faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:

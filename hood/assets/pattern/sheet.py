@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.assets.pattern.making import Fastener, construction_of, folded
+from hood.assets.pattern.making import Fastener, construction_of, laid
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
+from hood.assets.pattern.riding import in_triangles, inside
 from hood.mesh import topology
 from hood.mesh.flat import Construction
 
@@ -23,8 +24,8 @@ _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 _HALVED = 5
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
-#: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
-_CURVED, _AT_ONCE = 32, 1 << 21
+#: Points of a curve that tell how far it reaches.
+_CURVED = 32
 #: No pairs.
 _NONE = np.zeros((0, 2), dtype=np.int64)
 
@@ -119,9 +120,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         exact = np.concatenate([side.evenly(_CURVED) for side in panel.edges])
         tables.append(points - exact.min(axis=0) + [at, 0.0])  # in one place, whatever the edge length
         at += float(np.ptp(exact[:, 0])) + _MARGIN
-        across = all(place is not None for places in ends[panel.name] for place in places)
-        laid = folded(points, panel.folds if across else (), np.sign(_signed_area(exact)))
-        placed.append(laid @ panel.rotation.T + panel.translation)
+        placed.append(_begun(panel, points, ends[panel.name]))
         faces.append(triangles + start)
         owner.append(np.full(len(triangles), number))
         start += len(points)
@@ -197,21 +196,15 @@ def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarra
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
 
 
-def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
-    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
-        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
-        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
-        face[rows] = bary.min(axis=2).argmax(axis=1)
-        weights[rows] = bary[np.arange(len(rows)), face[rows]]
-    weights = weights.clip(min=0.0)
-    return face, weights / weights.sum(axis=1, keepdims=True)
-
-
 #: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.
 _Place = tuple[int, float] | None
+
+
+def _begun(panel: PatternPanel, points: np.ndarray, ends: list[tuple[_Place, _Place]]) -> np.ndarray:
+    """(N, 3) m: where points (N, 2) of a panel begin, its pleats laid; these are folds from outline to outline."""
+    across = all(place is not None for pair in ends for place in pair)
+    outer = float(np.sign(_signed_area(np.array([edge.start for edge in panel.edges]))))
+    return np.asarray(laid(points, panel.folds if across else (), outer) @ panel.rotation.T + panel.translation)
 
 
 def _fold_ends(panel: PatternPanel, edge: float) -> list[tuple[_Place, _Place]]:
@@ -284,7 +277,7 @@ def _meshed(
     first = np.cumsum([0, *(len(line) for line in lines)])
     sides = [np.arange(first[k], first[k + 1] + 1) % len(outline) for k in range(len(lines))]
     points, creases = _creased(panel, outline, sides, shares, ends, edge, where)
-    inner = _grid_inside(outline, edge)
+    inner = _gridinside(outline, edge)
     if len(creases) and len(inner):
         dense = np.concatenate([_dense(points[line], edge) for line in creases])
         inner = inner[cKDTree(dense).query(inner)[0] > _FROM_OUTLINE * edge]
@@ -379,7 +372,7 @@ def _signed_area(outline: np.ndarray) -> float:
     return 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
 
 
-def _grid_inside(outline: np.ndarray, edge: float) -> np.ndarray:
+def _gridinside(outline: np.ndarray, edge: float) -> np.ndarray:
     """Points (N, 2) of a triangular grid inside an outline, not too near to it."""
     low, high = outline.min(axis=0), outline.max(axis=0)
     rise = edge * np.sqrt(0.75)
@@ -400,19 +393,6 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     count = max(int(np.ceil(4.0 * np.linalg.norm(following - outline, axis=1).max() / edge)), 1)
     share = np.arange(count)[:, None, None] / count
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
-
-
-def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
-    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
-    u, v = following.T
-    result = np.zeros(len(points), dtype=bool)
-    for k in range(len(outline)):
-        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
-        if crossed.any():
-            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
-            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
-    return result
 
 
 def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, names: list[str], where: str) -> None:

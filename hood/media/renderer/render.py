@@ -414,10 +414,10 @@ def _creased(pos: _Array, faces: NDArray[np.int64], normal: _Array) -> tuple[NDA
     around = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - ends[0], count)] // 3
     # Of the faces around the vertex those on this side of the fold share its normal.
     alike = (flat[around] * flat[own[row, 0]]).sum(axis=1) > 0.5
-    total = np.stack([np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)], axis=1)
+    sums = [np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)]
     faces = faces.copy()
     faces[off] = len(pos) + np.arange(len(own))
-    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(total)
+    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(np.stack(sums, axis=1, dtype=np.float64))
 
 
 def _blend(weights: _Array, values: _Array, corners: NDArray[np.int64]) -> _Array:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.body.body import Body
 from hood.assets.pattern.designs import draft
-from hood.assets.pattern.making import Fold, folded
+from hood.assets.pattern.making import Fold, laid
 from hood.assets.pattern.measures import Measures, measure_body
 from hood.assets.pattern.pattern import read_pattern, write_pattern
 from hood.assets.pattern.riding import riders_of
@@ -108,15 +108,15 @@ def test_laid_pleats_keep_lengths_and_are_as_wide_as_what_is_seen(measures: Meas
     for pleat in ("knife", "box"):
         panel = draft("pleated", measures, {"pleat": pleat}).panels["skirt_front_left"]
         points = np.concatenate([edge.evenly(8)[:-1] for edge in panel.edges])
-        laid = folded(points, panel.folds, 1.0)
+        placed = laid(points, panel.folds, 1.0)
         # From one fold to the next the cloth is flat: every side of the outline keeps its chord.
-        chords = [np.linalg.norm(np.diff(table[k : k + 9], axis=0), axis=1) for k in (0, 8) for table in (points, laid)]
+        chords = [np.linalg.norm(np.diff(table[k : k + 9], axis=0), axis=1) for k in (0, 8) for table in (points, placed)]
         np.testing.assert_allclose(chords[1], chords[0], rtol=1e-9)
         np.testing.assert_allclose(chords[3], chords[2], rtol=1e-9)
-        assert np.ptp(laid[:, 0]) < 0.75 * np.ptp(points[:, 0])
-        assert 0.005 < np.ptp(laid[:, 2]) < 0.06
+        assert np.ptp(placed[:, 0]) < 0.75 * np.ptp(points[:, 0])
+        assert 0.005 < np.ptp(placed[:, 2]) < 0.06
     flat = np.array([[0.0, 0.0], [1.0, 2.0]])
     one = Fold(np.array([0.5, 0.0]), np.array([0.5, 1.0]), 2.0)
     other = Fold(np.array([0.0, 0.5]), np.array([1.0, 0.5]), 2.0)  # crosses it: these are no pleats
     for folds in ([one], [one, other]):
-        np.testing.assert_array_equal(folded(flat, folds, 1.0), [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
+        np.testing.assert_array_equal(laid(flat, folds, 1.0), [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
