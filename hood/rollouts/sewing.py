@@ -28,7 +28,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.sewn import Sewn, joints_of, judged, limbs_in
+from hood.rollouts.sewn import Sewn, held_limbs, joints_of, judged, limbs_in
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
@@ -44,8 +44,10 @@ if TYPE_CHECKING:
 _GIRTHS, _GROWTH = (0.15, 0.3, 0.45, 0.6), 0.012
 #: In the last attempt it grows by so much [m], within a coarse mesh of so many vertices.
 _SLOWER, _FINER = 0.006, 1600
-#: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body.
+#: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body; farther ones up or down
+#: where limbs are in none of the openings with these.
 _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
+_FARTHER = (-0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25, 0.3, -0.3)
 #: A step in which a vertex goes farther than twice this [m] is taken again with half the time; steps grow while none does.
 _STRIDE = 0.02
 #: Steps without weight last from the first to the second [s], those under it to the third; so many at most of each.
@@ -125,11 +127,12 @@ def sew_pattern(
     began = time.perf_counter()
     coarse = _coarser(pattern, sheet, _COARSE)
     arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
-    first = sewing_starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
+    starts = [sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms]
+    first = starts[0]
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
-        ways = [first, *(sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
+        ways = sorted(starts, key=lambda start: _empty(coarse, start))
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
@@ -186,23 +189,38 @@ def sleeved(pattern: Pattern) -> bool:
 
 
 def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[SewingStart]:
-    """Places of the pattern before and behind a body, that with the fewest triangles through the thin body first; and of its
-    girths the greatest with which there are no more."""
+    """Places of the pattern before and behind a body with limbs in as many openings as can be had, that with the fewest
+    triangles through the thin body first; and of its girths the greatest with which there are no more."""
     surface, bones = posed.surface, _bones(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
+
+    def placed(lifts: Sequence[float]) -> list[tuple[int, float, float]]:
+        ways = [(lift, depth) for depth in _DEPTHS for lift in lifts]
+        return [(_empty(sheet, SewingStart(posed, posed, lift + higher, depth, 0.0)), lift, depth) for lift, depth in ways]
+
+    near = placed(_LIFTS)
+    least = min(near)[0]
+    far = placed(_FARTHER) if least > 0 else near
+    places = near if min(far)[0] == least else far
+    places = [place for place in places if place[0] == min(places)[0]]
     best: list[tuple[int, float, SewingStart]] = []
     for thin in sorted(girths):
         body, found = bones + thin * (surface - bones), []
-        for depth in _DEPTHS:
-            for lift in _LIFTS:
-                start = SewingStart(posed, posed, lift + higher, depth, thin)
-                crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
-                found.append((crossed, abs(lift) + abs(depth), start))
+        for _, lift, depth in places:
+            start = SewingStart(posed, posed, lift + higher, depth, thin)
+            crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
+            found.append((crossed, abs(lift) + abs(depth), start))
         found.sort(key=lambda one: one[:2])
         if best and found[0][0] > best[0][0]:
             break
         best = found
     return [start for _, _, start in best]
+
+
+def _empty(sheet: PatternSheet, start: SewingStart) -> int:
+    """How many openings begin with no limb in them."""
+    pos = start.placed(sheet)
+    return sum(not limbs for _, limbs in held_limbs(sheet.faces, pos, start.before, pos))
 
 
 @torch.no_grad()
@@ -286,11 +304,10 @@ class _Work:
 
     def __init__(self, sheet: PatternSheet, start: SewingStart, material: Material, held: np.ndarray) -> None:
         self.began = time.perf_counter()
-        self.start, self.faces, self.held = start, sheet.faces, held
-        self.begun = start.placed(sheet)
-        firm, flat = sheet.stiffness, sheet.flat
+        self.start, self.faces, self.flat, self.held = start, sheet.faces, sheet.flat, held
+        self.begun, firm = start.placed(sheet), sheet.stiffness
         self.cloth = build_cloth(
-            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=flat, made=sheet.made
+            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=self.flat, made=sheet.made
         )
         posed = start.posed
         skin, thin, faces = posed.surface, start.thin_body(), posed.faces
@@ -306,7 +323,7 @@ class _Work:
     def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
         """What has come of it."""
         start, at = self.start, pos.numpy()
-        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed, start.before)
+        figures = judged(self.cloth, self.faces, start.posed, self.flat, at, self.begun, self.held, speed, start.before)
         return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
 
     def body(self, share: float, later: float) -> Obstacle:

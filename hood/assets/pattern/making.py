@@ -24,7 +24,7 @@ from hood.mesh import topology
 from hood.mesh.flat import Construction, stretched_sides
 
 if TYPE_CHECKING:
-    from hood.assets.pattern.pattern import Pattern
+    from hood.assets.pattern.pattern import Pattern, PatternPanel, Stitch
     from hood.assets.pattern.sheet import PatternSheet
 
 #: What elastic and the stiffness of seams may be [factors], and how wide [m] a hem or a band of elastic is that does not say.
@@ -92,6 +92,31 @@ def stitch_making(where: str, first: Mapping[str, Any], second: Mapping[str, Any
     made = _made(where, second, ("angle", "bending")) | _made(where, first, ("angle", "bending"))
     angle = _angle(where, made["angle"]) if "angle" in made else None
     return angle, _factor(where, "bending", made.get("bending", 1.0), _STIFF)
+
+
+def written(piece: PatternPanel | EdgeMaking | Stitch | Fold) -> dict[str, Any]:
+    """What the key ``hood`` of a panel, an edge or a side of a stitch says, in centimetres; nothing where it is made as any.
+
+    Numbers are rounded to 10 digits: degrees that were read are those that are written.
+    """
+    made: dict[str, Any] = {}
+    for name, value in vars(piece).items():
+        if name == "elastic" and value not in (1.0, (1.0, 1.0)):
+            made[name] = value if isinstance(value, float) else list(value)
+        elif (name == "bending" and value != 1.0) or (name == "width" and value != _HEM):
+            made[name] = round(value * (100.0 if name == "width" else 1.0), 10)
+        elif name == "angle" and value is not None:
+            made[name] = round(float(np.degrees(value)), 10)
+        elif name == "folds" and value:
+            made[name] = [
+                {"from": in_centimetres(fold.start), "to": in_centimetres(fold.end), **written(fold)["hood"]} for fold in value
+            ]
+    return {"hood": made} if made else {}
+
+
+def in_centimetres(point: np.ndarray) -> list[float]:
+    """A point [m] as it is written: a picometre is less than its rounding."""
+    return [round(100.0 * float(value), 10) + 0.0 for value in point]
 
 
 def _made(where: str, own: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:

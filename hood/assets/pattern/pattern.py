@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
-from hood.assets.pattern.making import EdgeMaking, Fold, edge_making, panel_making, stitch_making
+from hood.assets.pattern.making import EdgeMaking, Fold, edge_making, in_centimetres, panel_making, stitch_making, written
 
 #: Two edges that are sewn may differ in length by this factor: gathers of generated patterns reach 2.2.
 MOST_GATHERED = 4.0
@@ -341,31 +341,26 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     Edges stand in the order of the loop; an existing file is replaced at once or not at all.
 
     Raises:
-        ValueError: an edge whose curve has more than two control points, which the format has not; what the key ``hood`` says,
-            which is read and not written.
+        ValueError: an edge whose curve has more than two control points, which the format has not.
     """
     panels = {}
-    if any(stitch.angle is not None or stitch.bending != 1.0 for stitch in pattern.stitches):
-        raise ValueError(f"{path}: angles and stiffness of seams are not written; write the stitches' key hood into the file")
     for name, panel in pattern.panels.items():
-        if panel.elastic != (1.0, 1.0) or panel.folds or any(edge.making != EdgeMaking() for edge in panel.edges):
-            raise ValueError(
-                f"{path}: panel {name!r}: elastic, folds and hems are not written; write its key hood into the file"
-            )
         edges = [_written(f"{path}: panel {name!r}, edge {k}", k, len(panel.edges), edge) for k, edge in enumerate(panel.edges)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of turns for which several triples of angles stand
             angles = Rotation.from_matrix(panel.rotation).as_euler("xyz", degrees=True)
         panels[name] = {
-            "translation": _rounded(100.0 * panel.translation),
-            "rotation": _rounded(angles),
-            "vertices": [_rounded(100.0 * edge.start) for edge in panel.edges],
+            "translation": in_centimetres(panel.translation),
+            "rotation": [round(float(angle), 10) + 0.0 for angle in angles],
+            "vertices": [in_centimetres(edge.start) for edge in panel.edges],
             "edges": edges,
             "label": panel.label,
+            **written(panel),
         }
     stitches: list[list[Any]] = []
     for stitch in pattern.stitches:
         sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
+        sides[0] |= written(stitch)
         stitches.append([*sides, "right_wrong"] if stitch.same else sides)
     properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
     properties["body_height"] = round(100.0 * pattern.height, 10)
@@ -378,13 +373,8 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     write_atomically(Path(path), (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _rounded(values: np.ndarray) -> list[float]:
-    """Numbers as they are written: a picometre is less than their rounding."""
-    return [round(float(value), 10) + 0.0 for value in values]
-
-
 def _written(where: str, number: int, count: int, edge: Edge) -> dict[str, Any]:
-    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count]}
+    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count], **written(edge.making)}
     if edge.arc is not None:
         radius, large, right = edge.arc
         content["curvature"] = {"type": "circle", "params": [100.0 * radius, int(large), int(right)]}

@@ -281,13 +281,25 @@ def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], messa
         _sheet(tmp_path, _made(**hood))
 
 
-@pytest.mark.parametrize("place", ["panel", "edge", "stitch"])
-def test_what_is_not_written_is_refused(place: str, tmp_path: Path) -> None:
+def test_how_a_pattern_is_made_is_written(tmp_path: Path) -> None:
     content = skirt()
     own = content["pattern"]["panels"]["front"]
-    table = {"panel": own, "edge": own["edges"][0], "stitch": content["pattern"]["stitches"][0][0]}[place]
-    table["hood"] = {"panel": {"elastic": 0.9}, "edge": {"bending": 3}, "stitch": {"angle": 90}}[place]
+    says = [
+        (own, {"elastic": [0.85, 1.1], "folds": [{"from": [-3, 70.3], "to": [3.1, 90], "angle": 150, "bending": 2}]}),
+        (own["edges"][0], {"elastic": 0.7, "bending": 3, "width": 1.7}),
+        (own["edges"][1], {"width": 4}),
+        (content["pattern"]["stitches"][0][0], {"angle": -33.3, "bending": 4}),
+    ]
+    for table, made in says:
+        table["hood"] = made
     pattern = read_pattern(write(tmp_path / "skirt.json", content))
-    with pytest.raises(ValueError, match="not written"):
-        write_pattern(tmp_path / "again.json", pattern)
-    assert not (tmp_path / "again.json").exists()
+    write_pattern(tmp_path / "again.json", pattern)
+    again = json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))["pattern"]
+    front = again["panels"]["front"]
+    kept = [front["hood"], front["edges"][0]["hood"], front["edges"][1]["hood"], again["stitches"][0][0]["hood"]]
+    assert kept == [made for _, made in says]
+    assert json.dumps(again).count('"hood"') == 4
+    other = read_pattern(tmp_path / "again.json")
+    sheets = [sheet_of(one, 0.04, "skirt").made for one in (pattern, other)]
+    for name, table in vars(sheets[0]).items():
+        assert np.array_equal(table, vars(sheets[1])[name], equal_nan=True)
