@@ -76,6 +76,10 @@ _APART = (5.0, 10.0)
 _BESIDE, _HIGH = 0.19, 0.9
 #: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
 _LOW, _PRESSED = 0.15, 0.06
+#: Panels begin no farther before and behind the body [m].
+_DEEPEST = 0.25
+#: Where more than so many triangles pass through the thin body, starts of these shares of the width are looked at.
+_TANGLED, _NARROW = 40, (0.85, 0.7)
 #: The floor reaches so far [m] from the middle, in squares of the second.
 _FLOOR, _SQUARE = 1.2, 0.1
 
@@ -87,6 +91,7 @@ class SewingStart:
     Args:
         before: the body as the pattern has it, which becomes ``posed`` as it grows.
         growth: m, that a vertex of the body moves by at most in a step.
+        narrow: share of its width that it begins with: sides of wide panels would pass through the arms.
     """
 
     before: PosedBody
@@ -95,6 +100,7 @@ class SewingStart:
     depth: float
     thin: float
     growth: float = _GROWTH
+    narrow: float = 1.0
 
     def thin_body(self) -> np.ndarray:
         """(W, 3) m: the skin of the body at the beginning."""
@@ -102,8 +108,10 @@ class SewingStart:
         return np.asarray(bones + self.thin * (self.before.surface - bones))
 
     def placed(self, sheet: PatternSheet) -> np.ndarray:
-        """(V, 3) m: the vertices of a pattern; what reaches below the floor is pressed together above it."""
-        pos = sheet.pos + [0.0, self.lift, self.depth]
+        """(V, 3) m: the vertices of a pattern; what reaches below the floor or far before and behind the body is pressed
+        together."""
+        deep = min(1.0, _DEEPEST / max(float(np.abs(sheet.pos[:, 2]).max()), 1e-9))
+        pos = sheet.pos * [self.narrow, 1.0, deep] + [0.0, self.lift, self.depth]
         low = np.minimum(pos[:, 1], _PRESSED)
         pos[:, 1] += _PRESSED * np.exp((low - _PRESSED) / _PRESSED) - low
         return np.asarray(pos + [0.0, float(self.before.surface[:, 1].min()), 0.0])
@@ -132,7 +140,7 @@ def sew_pattern(
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
-        ways = sorted(starts, key=lambda start: _empty(coarse, start))
+        ways = sorted(starts, key=lambda start: _worn(coarse, start), reverse=True)
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
@@ -194,33 +202,41 @@ def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float]
     surface, bones = posed.surface, _bones(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
 
-    def placed(lifts: Sequence[float]) -> list[tuple[int, float, float]]:
-        ways = [(lift, depth) for depth in _DEPTHS for lift in lifts]
-        return [(_empty(sheet, SewingStart(posed, posed, lift + higher, depth, 0.0)), lift, depth) for lift, depth in ways]
+    def placed(lifts: Sequence[float], narrow: float = 1.0) -> list[tuple[tuple[int, int], SewingStart]]:
+        ways = [(lift + higher, depth) for depth in _DEPTHS for lift in lifts]
+        starts = [SewingStart(posed, posed, *way, 0.0, narrow=narrow) for way in ways]
+        ranked = [(_worn(sheet, start), start) for start in starts]
+        most = max(worn for worn, _ in ranked)
+        return [(worn, start) for worn, start in ranked if worn == most]
 
-    near = placed(_LIFTS)
-    least = min(near)[0]
-    far = placed(_FARTHER) if least > 0 else near
-    places = near if min(far)[0] == least else far
-    places = [place for place in places if place[0] == min(places)[0]]
-    best: list[tuple[int, float, SewingStart]] = []
-    for thin in sorted(girths):
+    places, far = placed(_LIFTS), placed(_FARTHER)
+    places = far if far[0][0][0] > places[0][0][0] else places
+    def crossed(worn: Sequence[tuple[tuple[int, int], SewingStart]], thin: float) -> list[tuple[int, float, SewingStart]]:
         body, found = bones + thin * (surface - bones), []
-        for _, lift, depth in places:
-            start = SewingStart(posed, posed, lift + higher, depth, thin)
-            crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
-            found.append((crossed, abs(lift) + abs(depth), start))
-        found.sort(key=lambda one: one[:2])
-        if best and found[0][0] > best[0][0]:
+        for start in (replace(start, thin=thin) for _, start in worn):
+            pairs = crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs
+            found.append((len(pairs), abs(start.lift - higher) + abs(start.depth), start))
+        return sorted(found, key=lambda one: one[:2])
+
+    thinnest, *others = sorted(girths)
+    best = crossed(places, thinnest)
+    for narrow in _NARROW:
+        if best[0][0] > _TANGLED and (fewer := placed(_LIFTS, narrow))[0][0] >= places[0][0]:
+            found = crossed(fewer, thinnest)
+            places, best = (fewer, found) if found[0][0] < best[0][0] else (places, best)
+    for thin in others:
+        found = crossed(places, thin)
+        if found[0][0] > best[0][0]:
             break
         best = found
     return [start for _, _, start in best]
 
 
-def _empty(sheet: PatternSheet, start: SewingStart) -> int:
-    """How many openings begin with no limb in them."""
+def _worn(sheet: PatternSheet, start: SewingStart) -> tuple[int, int]:
+    """How many arms and legs begin alone in an opening, and how many openings with a part of the body in them."""
     pos = start.placed(sheet)
-    return sum(not limbs for _, limbs in held_limbs(sheet.faces, pos, start.before, pos))
+    limbs = [limbs for _, limbs in held_limbs(sheet.faces, pos, start.before, pos)]
+    return len({one for one in limbs if len(one) == 1} - {frozenset({"trunk"})}), sum(map(bool, limbs))
 
 
 @torch.no_grad()

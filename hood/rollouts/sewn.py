@@ -29,6 +29,8 @@ _COARSE_STRAIN = 0.6
 REST_SPEED = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
 _LOOSE, _UNDER = 0.04, 5e-3
+#: A forearm with its hand is so many times as long as to the wrist.
+_HAND = 1.7
 #: Of the limbs.
 _ARMS = frozenset({"left arm", "right arm"})
 #: An opening of less than this length [body heights] is a slit; one that is drawn less plane than this share of its size has no
@@ -168,8 +170,9 @@ def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     found: set[str] = set()
     near: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
-        limb = _limb(joint)
-        if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
+        limb, start, end = _limb(joint), joints[parents[joint]], joints[joint]
+        end = start + _HAND * (end - start) if JOINTS[joint].endswith("wrist") else end
+        if limb is not None and _passes(start, end, middle, rim, after):
             (near if JOINTS[joint].endswith("shoulder") else found).add(limb)
     if {"left leg", "right leg"} <= found:
         found = (found - {"left leg", "right leg"}) | {"trunk"}

@@ -159,9 +159,10 @@ def test_openings_around_other_limbs_are_told(tmp_path: Path, body: Body) -> Non
         return np.concatenate([ring + knee + [0.0, 0.1, 0.0], ring + knee - [0.0, 0.1, 0.0]])
 
     left, right = tube(joint["left_knee"][0]), tube(joint["right_knee"][0])
-    cloth = build_cloth(left, faces, Material(), dtype=torch.float64)
+    cut = left[faces][..., [0, 1]] + 0.1 * left[faces][..., [2, 2]]
+    cloth = build_cloth(left, faces, Material(), dtype=torch.float64, flat=cut)
     none = np.zeros(len(left), dtype=bool)
-    assert judged(cloth, faces, posed, left, left, none, 0.0).swapped == ()
-    told = judged(cloth, faces, posed, left, right, none, 0.0)
+    assert judged(cloth, faces, posed, cut, left, left, none, 0.0).swapped == ()
+    told = judged(cloth, faces, posed, cut, left, right, none, 0.0)
     assert told.swapped == ("the left leg, not the right leg",) * 2
-    assert told.faults == ["an opening holds the left leg, not the right leg; another the left leg, not the right leg"]
+    assert told.faults[-1:] == ["an opening holds the left leg, not the right leg; another the left leg, not the right leg"]
