@@ -124,7 +124,8 @@ def sew_pattern(
     """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and girth.
 
     Args:
-        angle: of the arms below the T-pose, degrees; None: 45 with sleeves and 0 without, and the other in an attempt.
+        angle: of the arms below the T-pose, degrees; None: 45 and 0, first that in which more limbs begin in openings of their
+            own, else 45 with sleeves and 0 without.
 
     Examples:
         >>> sheet = sheet_of(pattern, 0.012, "shirt")  # doctest: +SKIP
@@ -135,11 +136,11 @@ def sew_pattern(
     began = time.perf_counter()
     coarse = _coarser(pattern, sheet, _COARSE)
     arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
-    starts = [sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms]
-    first = starts[0]
+    first = sewing_starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
+        starts = [first, *(sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
         ways = sorted(starts, key=lambda start: _worn(coarse, start), reverse=True)
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
@@ -209,8 +210,10 @@ def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float]
         most = max(worn for worn, _ in ranked)
         return [(worn, start) for worn, start in ranked if worn == most]
 
-    places, far = placed(_LIFTS), placed(_FARTHER)
+    places = placed(_LIFTS)
+    far = placed(_FARTHER) if places[0][0][1] < 0 else places
     places = far if far[0][0][0] > places[0][0][0] else places
+
     def crossed(worn: Sequence[tuple[tuple[int, int], SewingStart]], thin: float) -> list[tuple[int, float, SewingStart]]:
         body, found = bones + thin * (surface - bones), []
         for start in (replace(start, thin=thin) for _, start in worn):
@@ -233,10 +236,10 @@ def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float]
 
 
 def _worn(sheet: PatternSheet, start: SewingStart) -> tuple[int, int]:
-    """How many arms and legs begin alone in an opening, and how many openings with a part of the body in them."""
+    """How many arms and legs begin alone in an opening; and how many openings with nothing in them, below 0."""
     pos = start.placed(sheet)
     limbs = [limbs for _, limbs in held_limbs(sheet.faces, pos, start.before, pos)]
-    return len({one for one in limbs if len(one) == 1} - {frozenset({"trunk"})}), sum(map(bool, limbs))
+    return len({one for one in limbs if len(one) == 1} - {frozenset({"trunk"})}), -sum(not one for one in limbs)
 
 
 @torch.no_grad()

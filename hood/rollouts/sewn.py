@@ -202,7 +202,9 @@ def _passes(start: np.ndarray, end: np.ndarray, middle: np.ndarray, rim: np.ndar
     return bool(int(hit.sum()) % 2)
 
 
-def held_limbs(faces: np.ndarray, pos: np.ndarray, posed: PosedBody, drawn: np.ndarray) -> list[tuple[np.ndarray, frozenset[str]]]:
+def held_limbs(
+    faces: np.ndarray, pos: np.ndarray, posed: PosedBody, drawn: np.ndarray
+) -> list[tuple[np.ndarray, frozenset[str]]]:
     """Openings of a garment at ``pos`` (V, 3) [m] and what is in them (:func:`limbs_in`), without slits and those that are not
     about plane at ``drawn`` (V, 3) [m]."""
     least = _LEAST_LENGTH * float(np.ptp(posed.surface, axis=0).max())
