@@ -127,8 +127,8 @@ def judged(
     speed: float,
     before: PosedBody | None = None,
 ) -> SewnFigures:
-    """:class:`SewnFigures` of cloth, cut as ``cut`` (F, 3, 2) [m], at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m] on the body ``before``, or on the
-    same; ``held`` (V,) bool."""
+    """:class:`SewnFigures` of cloth, cut as ``cut`` (F, 3, 2) [m], at ``pos`` (V, 3) [m], that began at ``begun`` (V, 3) [m] on
+    the body ``before``, or on the same; ``held`` (V,) bool."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     assert cloth.flat is not None
