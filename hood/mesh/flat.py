@@ -64,11 +64,24 @@ def masses(flat: Tensor, faces: Tensor, density: Tensor | float, num_vertices: i
 
 def edge_lengths(flat: Tensor, faces: Tensor, edges: Tensor) -> Tensor:
     """Lengths (E,) [m] of ``edges`` (E, 2) of a mesh with ``faces`` (F, 3), means over the faces at each."""
-    sides = torch.stack([flat[:, 0], flat[:, 1] - flat[:, 0], flat[:, 1]], dim=1).norm(dim=2).reshape(-1)
-    ends = faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2)
-    row = torch.as_tensor(topology.edge_index(edges.cpu().numpy(), ends.cpu().numpy()), device=flat.device)
+    sides, row = _lengths_by_edge(flat, faces, edges)
     total, count = flat.new_zeros(2, len(edges)).unbind(dim=0)
     return total.index_add(0, row, sides) / count.index_add(0, row, torch.ones_like(sides)).clamp_min(1.0)
+
+
+def edge_extents(flat: Tensor, faces: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the greatest length (E,) [m] that the faces at each of ``edges`` (E, 2) say."""
+    sides, row = _lengths_by_edge(flat, faces, edges)
+    least, most = (flat.new_full((len(edges),), start) for start in (torch.inf, 0.0))
+    return least.scatter_reduce(0, row, sides, "amin"), most.scatter_reduce(0, row, sides, "amax")
+
+
+def _lengths_by_edge(flat: Tensor, faces: Tensor, edges: Tensor) -> tuple[Tensor, Tensor]:
+    """Lengths (3F,) [m] of the sides of the faces, and their rows in ``edges`` (E, 2)."""
+    sides = torch.stack([flat[:, 0], flat[:, 1] - flat[:, 0], flat[:, 1]], dim=1).norm(dim=2).reshape(-1)
+    ends = faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2)
+    row = topology.edge_index(edges.cpu().numpy(), ends.cpu().numpy())
+    return sides, torch.as_tensor(row, device=flat.device)
 
 
 def hinge_lengths(flat: Tensor, faces: Tensor, hinges: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.sewn import Sewn, joints_of, judged, limbs_in
+from hood.rollouts.sewn import Sewn, held_limbs, joints_of, judged, limbs_in
 from hood.scene.holding import fastening_of
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
@@ -48,8 +48,10 @@ if TYPE_CHECKING:
 _GIRTHS, _GROWTH = (0.15, 0.3, 0.45, 0.6), 0.012
 #: In the last attempt it grows by so much [m], within a coarse mesh of so many vertices.
 _SLOWER, _FINER = 0.006, 1600
-#: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body.
+#: Ways up and forward [m] that are tried for a start with the fewest triangles through the thin body; farther ones up or down
+#: where limbs are in none of the openings with these.
 _LIFTS, _DEPTHS = (0.0, 0.03, -0.03, 0.06, 0.1), (0.0, -0.03, 0.03)
+_FARTHER = (-0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25, 0.3, -0.3)
 #: A step in which a vertex goes farther than twice this [m] is taken again with half the time; steps grow while none does.
 _STRIDE = 0.02
 #: Steps without weight last from the first to the second [s], those under it to the third; so many at most of each.
@@ -78,6 +80,10 @@ _APART = (5.0, 10.0)
 _BESIDE, _HIGH = 0.19, 0.9
 #: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
 _LOW, _PRESSED = 0.15, 0.06
+#: Panels begin no farther before and behind the body [m].
+_DEEPEST = 0.25
+#: Where more than so many triangles pass through the thin body, starts of these shares of the width are looked at.
+_TANGLED, _NARROW = 40, (0.85, 0.7)
 #: The floor reaches so far [m] from the middle, in squares of the second.
 _FLOOR, _SQUARE = 1.2, 0.1
 
@@ -89,6 +95,7 @@ class SewingStart:
     Args:
         before: the body as the pattern has it, which becomes ``posed`` as it grows.
         growth: m, that a vertex of the body moves by at most in a step.
+        narrow: share of its width that it begins with: sides of wide panels would pass through the arms.
     """
 
     before: PosedBody
@@ -97,6 +104,7 @@ class SewingStart:
     depth: float
     thin: float
     growth: float = _GROWTH
+    narrow: float = 1.0
 
     def thin_body(self) -> np.ndarray:
         """(W, 3) m: the skin of the body at the beginning."""
@@ -104,8 +112,10 @@ class SewingStart:
         return np.asarray(bones + self.thin * (self.before.surface - bones))
 
     def placed(self, sheet: PatternSheet) -> np.ndarray:
-        """(V, 3) m: the vertices of a pattern; what reaches below the floor is pressed together above it."""
-        pos = sheet.pos + [0.0, self.lift, self.depth]
+        """(V, 3) m: the vertices of a pattern; what reaches below the floor or far before and behind the body is pressed
+        together."""
+        deep = min(1.0, _DEEPEST / max(float(np.abs(sheet.pos[:, 2]).max()), 1e-9))
+        pos = sheet.pos * [self.narrow, 1.0, deep] + [0.0, self.lift, self.depth]
         low = np.minimum(pos[:, 1], _PRESSED)
         pos[:, 1] += _PRESSED * np.exp((low - _PRESSED) / _PRESSED) - low
         return np.asarray(pos + [0.0, float(self.before.surface[:, 1].min()), 0.0])
@@ -118,7 +128,8 @@ def sew_pattern(
     """A pattern, meshed as ``sheet``, sewn around a body: the best of three attempts, which differ in pose and girth.
 
     Args:
-        angle: of the arms below the T-pose, degrees; None: 45 with sleeves and 0 without, and the other in an attempt.
+        angle: of the arms below the T-pose, degrees; None: 45 and 0, first that in which more limbs begin in openings of their
+            own, else 45 with sleeves and 0 without.
 
     Examples:
         >>> sheet = sheet_of(pattern, 0.012, "shirt")  # doctest: +SKIP
@@ -133,7 +144,8 @@ def sew_pattern(
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
     else:
-        ways = [first, *(sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
+        starts = [first, *(sewing_starts(coarse, _standing(body, betas, other, 0.0))[0] for other in arms[1:])]
+        ways = sorted(starts, key=lambda start: _worn(coarse, start), reverse=True)
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
@@ -192,23 +204,48 @@ def sleeved(pattern: Pattern) -> bool:
 
 
 def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[SewingStart]:
-    """Places of the pattern before and behind a body, that with the fewest triangles through the thin body first; and of its
-    girths the greatest with which there are no more."""
+    """Places of the pattern before and behind a body with limbs in as many openings as can be had, that with the fewest
+    triangles through the thin body first; and of its girths the greatest with which there are no more."""
     surface, bones = posed.surface, _bones(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
-    best: list[tuple[int, float, SewingStart]] = []
-    for thin in sorted(girths):
+
+    def placed(lifts: Sequence[float], narrow: float = 1.0) -> list[tuple[tuple[int, int], SewingStart]]:
+        ways = [(lift + higher, depth) for depth in _DEPTHS for lift in lifts]
+        starts = [SewingStart(posed, posed, *way, 0.0, narrow=narrow) for way in ways]
+        ranked = [(_worn(sheet, start), start) for start in starts]
+        most = max(worn for worn, _ in ranked)
+        return [(worn, start) for worn, start in ranked if worn == most]
+
+    places = placed(_LIFTS)
+    far = placed(_FARTHER) if places[0][0][1] < 0 else places
+    places = far if far[0][0][0] > places[0][0][0] else places
+
+    def crossed(worn: Sequence[tuple[tuple[int, int], SewingStart]], thin: float) -> list[tuple[int, float, SewingStart]]:
         body, found = bones + thin * (surface - bones), []
-        for depth in _DEPTHS:
-            for lift in _LIFTS:
-                start = SewingStart(posed, posed, lift + higher, depth, thin)
-                crossed = len(crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs)
-                found.append((crossed, abs(lift) + abs(depth), start))
-        found.sort(key=lambda one: one[:2])
-        if best and found[0][0] > best[0][0]:
+        for start in (replace(start, thin=thin) for _, start in worn):
+            pairs = crossings(start.placed(sheet), sheet.faces, body, posed.faces).pairs
+            found.append((len(pairs), abs(start.lift - higher) + abs(start.depth), start))
+        return sorted(found, key=lambda one: one[:2])
+
+    thinnest, *others = sorted(girths)
+    best = crossed(places, thinnest)
+    for narrow in _NARROW:
+        if best[0][0] > _TANGLED and (fewer := placed(_LIFTS, narrow))[0][0] >= places[0][0]:
+            found = crossed(fewer, thinnest)
+            places, best = (fewer, found) if found[0][0] < best[0][0] else (places, best)
+    for thin in others:
+        found = crossed(places, thin)
+        if found[0][0] > best[0][0]:
             break
         best = found
     return [start for _, _, start in best]
+
+
+def _worn(sheet: PatternSheet, start: SewingStart) -> tuple[int, int]:
+    """How many arms and legs begin alone in an opening; and how many openings with nothing in them, below 0."""
+    pos = start.placed(sheet)
+    limbs = [limbs for _, limbs in held_limbs(sheet.faces, pos, start.before, pos)]
+    return len({one for one in limbs if len(one) == 1} - {frozenset({"trunk"})}), -sum(not one for one in limbs)
 
 
 @torch.no_grad()
@@ -305,11 +342,10 @@ class _Work:
 
     def __init__(self, sheet: PatternSheet, start: SewingStart, material: Material, held: np.ndarray) -> None:
         self.began = time.perf_counter()
-        self.start, self.faces, self.held = start, sheet.faces, held
-        self.begun = start.placed(sheet)
-        firm, flat = sheet.stiffness, sheet.flat
+        self.start, self.faces, self.flat, self.held = start, sheet.faces, sheet.flat, held
+        self.begun, firm = start.placed(sheet), sheet.stiffness
         self.cloth = build_cloth(
-            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=flat, made=sheet.made
+            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=self.flat, made=sheet.made
         )
         posed = start.posed
         skin, thin, faces = posed.surface, start.thin_body(), posed.faces
@@ -327,7 +363,9 @@ class _Work:
     def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
         """What has come of it."""
         start, at = self.start, pos.numpy()
-        figures = judged(self.cloth, self.faces, start.posed, at, self.begun, self.held, speed, start.before, self.closed)
+        figures = judged(
+            self.cloth, self.faces, start.posed, self.flat, at, self.begun, self.held, speed, start.before, self.closed
+        )
         return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
 
     def body(self, share: float, later: float) -> Obstacle:

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from hood.assets.body.body import JOINTS
 from hood.assets.fitting.suspicions import find_openings
 from hood.assets.garment.binding import signed_distances
+from hood.mesh.flat import edge_extents
 from hood.mesh.parts import rim_length
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
@@ -27,6 +29,10 @@ _COARSE_STRAIN = 0.6
 REST_SPEED = 2e-3
 #: A held waist is no farther from the skin [m], in the mean; a hem is no deeper under the floor [m].
 _LOOSE, _UNDER = 0.04, 5e-3
+#: A forearm with its hand is so many times as long as to the wrist.
+_HAND = 1.7
+#: Of the limbs.
+_ARMS = frozenset({"left arm", "right arm"})
 #: An opening of less than this length [body heights] is a slit; one that is drawn less plane than this share of its size has no
 #: part of the body of its own: the front of an open jacket.
 _LEAST_LENGTH, _PLANE = 0.07, 0.35
@@ -39,7 +45,8 @@ class SewnFigures:
     Args:
         body_crossings: triangles of cloth and skin that pass through each other, in pairs.
         self_crossings: of cloth and cloth.
-        strain_p99: of the lengths of its edges in the pattern.
+        strain_p99: of the lengths of its edges in the pattern: of what is beyond all of them where there are several, of
+            both sides of a gathered seam, of elastic at rest and as it is cut.
         empty_openings: with no part of the body in them, of ``openings``.
         sunk: m, of its highest point since it began.
         speed: m/s, the mean in the last step.
@@ -113,6 +120,7 @@ def judged(
     cloth: Cloth,
     faces: np.ndarray,
     posed: PosedBody,
+    cut: np.ndarray,
     pos: np.ndarray,
     begun: np.ndarray,
     held: np.ndarray,
@@ -120,12 +128,16 @@ def judged(
     before: PosedBody | None = None,
     closed: np.ndarray | None = None,
 ) -> SewnFigures:
-    """:class:`SewnFigures` of cloth at ``pos`` (V, 3) [m] that began at ``begun`` (V, 3) [m] on the body ``before``, or on the
-    same; ``held`` (V,) bool. Openings are those of the faces ``closed`` (G, 3), if not of all."""
+    """:class:`SewnFigures` of cloth, cut as ``cut`` (F, 3, 2) [m], at ``pos`` (V, 3) [m], that began at ``begun`` (V, 3) [m]
+    on the body ``before``, or on the same; ``held`` (V,) bool. Openings are those of the faces ``closed`` (G, 3), if not of all."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
+    assert cloth.flat is not None
     start, end = cloth.edges.numpy().T
-    strain = np.abs(np.linalg.norm(pos[end] - pos[start], axis=1) / cloth.rest_length.numpy() - 1.0)
+    length = np.linalg.norm(pos[end] - pos[start], axis=1)
+    known = torch.cat([cloth.flat, torch.as_tensor(cut[:, 1:] - cut[:, :1])])
+    least, most = (side.numpy() for side in edge_extents(known, torch.cat([cloth.faces] * 2), cloth.edges))
+    strain = np.maximum(length / most - 1.0, 1.0 - length / least).clip(min=0.0)
     closed = faces if closed is None else closed
     openings = find_openings(pos, closed, posed.surface, posed.faces)
     return SewnFigures(
@@ -161,8 +173,9 @@ def limbs_in(rim: np.ndarray, posed: PosedBody) -> frozenset[str]:
     near: set[str] = set()
     hips: set[str] = set()
     for joint in range(1, min(len(parents), len(JOINTS))):
-        limb = _limb(joint)
-        if limb is not None and _passes(joints[parents[joint]], joints[joint], middle, rim, after):
+        limb, start, end = _limb(joint), joints[parents[joint]], joints[joint]
+        end = start + _HAND * (end - start) if JOINTS[joint].endswith("wrist") else end
+        if limb is not None and _passes(start, end, middle, rim, after):
             (near if JOINTS[joint].endswith("shoulder") else hips if JOINTS[joint].endswith("hip") else found).add(limb)
     if {"left leg", "right leg"} <= found | hips:
         found = (found - {"left leg", "right leg"}) | {"trunk"}
@@ -193,16 +206,27 @@ def _passes(start: np.ndarray, end: np.ndarray, middle: np.ndarray, rim: np.ndar
     return bool(int(hit.sum()) % 2)
 
 
+def held_limbs(
+    faces: np.ndarray, pos: np.ndarray, posed: PosedBody, drawn: np.ndarray
+) -> list[tuple[np.ndarray, frozenset[str]]]:
+    """Openings of a garment at ``pos`` (V, 3) [m] and what is in them (:func:`limbs_in`), without slits and those that are not
+    about plane at ``drawn`` (V, 3) [m]."""
+    least = _LEAST_LENGTH * float(np.ptp(posed.surface, axis=0).max())
+    found = []
+    for loop in boundary_loops(faces):
+        spread = np.linalg.svd(drawn[loop] - drawn[loop].mean(axis=0), compute_uv=False)
+        if rim_length(pos, loop) >= least and spread[2] <= _PLANE * spread[1]:
+            found.append((loop, limbs_in(pos[loop], posed)))
+    return found
+
+
 def _swapped(faces: np.ndarray, before: PosedBody, begun: np.ndarray, posed: PosedBody, pos: np.ndarray) -> tuple[str, ...]:
     """Openings that hold other limbs at ``pos`` than where they began, in words."""
-    least = _LEAST_LENGTH * float(np.ptp(posed.surface, axis=0).max())
     told = []
-    for loop in boundary_loops(faces):
-        rim = pos[loop]
-        spread = np.linalg.svd(begun[loop] - begun[loop].mean(axis=0), compute_uv=False)
-        if rim_length(pos, loop) < least or spread[2] > _PLANE * spread[1]:
-            continue
-        made, holds = limbs_in(begun[loop], before), limbs_in(rim, posed)
+    for loop, holds in held_limbs(faces, pos, posed, begun):
+        made = limbs_in(begun[loop], before)
+        if {"trunk", *_ARMS} <= made:  # a cape: its hem may be above or below the arms
+            made, holds = made - _ARMS, holds - _ARMS
         if made and holds and made != holds:
             told.append(f"the {' and the '.join(sorted(holds))}, not the {' and the '.join(sorted(made))}")
     return tuple(told)

@@ -31,6 +31,7 @@ FAST = {
 SLOW = {
     "refined captured": (1e-6, 1025, 9630),
     "network captured by itself": (1e-5, 1405, 6490),
+    "network captured with elastic": (1e-5, 1300, 6490),
     "network": (1e-5, 1500, 0),
     "network fixed": (1e-5, 1000, 0),
     "paper's features": (1e-5, 2780, 0),

@@ -36,6 +36,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "network fixed": ("garment=tshirt", *NETWORK, *PLAIN, "step=fixed"),
     "network captured": ("garment=tshirt", *NETWORK, *PLAIN, "step=captured"),
     "paper's features": ("garment=tshirt", "checkpoint=small-ours", "refine=0", "settle=paper", "step=plain"),
+    "network captured with elastic": ("garment=tshirt", "size={hem:{elastic:0.85}}", *NETWORK, *PLAIN, "step=captured"),
     "solver": ("garment=tshirt", *SOLVER),
     "solver captured": ("garment=tshirt", *SOLVER, *PLAIN, "step=captured"),
     "refined": ("garment=tshirt", "checkpoint=quickstart", "refine=2"),

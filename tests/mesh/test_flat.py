@@ -17,7 +17,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import Cloth, build_cloth, concatenate_cloths
 from hood.energies.membrane import Stretching
 from hood.energies.potential import default_potential
-from hood.mesh.flat import followed, inverse, laid_out
+from hood.mesh.flat import edge_extents, edge_lengths, followed, inverse, laid_out
 from hood.scene.sizing import resized
 from hood.testing import cylinder, grid, make_problem
 
@@ -177,3 +177,13 @@ def test_a_flat_sheet_is_as_without() -> None:
     cloth = build_cloth(pos, faces, Material(), dtype=torch.float64, flat=pos[faces][:, :, across])
     for name in ("rest_length", "rest_area", "mass", "hinge_area", "edge_length_sq"):
         torch.testing.assert_close(getattr(cloth, name), getattr(plain, name))
+
+
+def test_the_sides_of_gathers_have_two_lengths() -> None:
+    faces, edges = torch.tensor([[0, 1, 2], [1, 0, 3]]), torch.tensor([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3]])
+    one, twice = torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([[2.0, 0.0], [0.0, 1.0]])
+    least, most = edge_extents(torch.stack([one, twice]), faces, edges)
+    assert (least[0], most[0]) == (1.0, 2.0)
+    assert torch.equal(least[1:], most[1:])
+    assert least[1] == 1.0
+    assert edge_lengths(torch.stack([one, twice]), faces, edges)[0] == 1.5

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sewing_patterns import PATTERNS, skirt, write
+from sewing_patterns import PATTERNS, skirt, tshirt, write
 
 from hood.assets.body.body import JOINTS, Body
 from hood.assets.garment.binding import posed_body
@@ -17,6 +17,8 @@ from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.pattern import read_pattern
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.cloth.cloth import build_cloth
+from hood.mesh.flat import Construction, laid_out
+from hood.mesh.topology import boundary_loops
 from hood.rollouts.sewing import sew_around, sew_pattern, sewing_starts, waist_of
 from hood.rollouts.sewn import Sewn, SewnFigures, joints_of, judged, limbs_in
 
@@ -146,22 +148,56 @@ def test_an_opening_is_told_by_the_limbs_in_it(body: Body) -> None:
     assert within("left_shoulder", "head", up) == set()
 
 
+def _tube(middle: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and flat faces of a tube that stands around a point, 20 cm high."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    quads = [[k, (k + 1) % 16, 16 + k] for k in range(16)] + [[(k + 1) % 16, 16 + (k + 1) % 16, 16 + k] for k in range(16)]
+    ring = middle + np.stack([radius * np.cos(angle), 0.0 * angle, radius * np.sin(angle)], axis=1)
+    pos, faces = np.concatenate([ring + [0.0, 0.1, 0.0], ring - [0.0, 0.1, 0.0]]), np.array(quads)
+    return pos, faces, np.pad(laid_out(torch.as_tensor(pos), torch.as_tensor(faces)).numpy(), ((0, 0), (1, 0), (0, 0)))
+
+
+def test_cloth_between_two_lengths_is_not_stretched(body: Body) -> None:
+    posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
+    pos, faces, cut = _tube(np.array([0.0, 0.0, 3.0]), 0.12)
+    made, none = Construction(elastic=np.full(faces.shape, 0.7)), np.zeros(len(pos), dtype=bool)
+    cloth = build_cloth(pos, faces, Material(), dtype=torch.float64, flat=cut, made=made)
+    for share, expected in ((1.0, 0.0), (0.8, 0.0), (1.2, 0.2), (0.63, 0.1)):  # of the lengths that are cut
+        assert judged(cloth, faces, posed, cut, share * pos, pos, none, 0.0).strain_p99 == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_hem_may_be_above_or_below_the_arms_that_it_was_made_around(body: Body) -> None:
+    posed = posed_body(body, arms_down(45.0), 0, np.zeros(10))
+    chest = dict(zip(JOINTS, joints_of(posed), strict=False))["spine2"] + [0.0, 0.0, 0.02]
+    (wide, faces, cut), (close, _, _) = _tube(chest, 0.7), _tube(chest, 0.25)
+    cloth, none = build_cloth(wide, faces, Material(), dtype=torch.float64, flat=cut), np.zeros(len(wide), dtype=bool)
+    assert limbs_in(wide[:16], posed) == {"trunk", "left arm", "right arm"}
+    assert judged(cloth, faces, posed, cut, close, wide, none, 0.0).swapped == ()
+    assert judged(cloth, faces, posed, cut, wide, close, none, 0.0).swapped != ()
+
+
+def test_a_wide_shirt_begins_around_the_arms(tmp_path: Path, body: Body) -> None:
+    path = write(tmp_path / "wide.json", tshirt(half=36, sleeve=30, hem=75))
+    sheet = sheet_of(read_pattern(path), 0.05, str(path))
+    posed = posed_body(body, arms_down(45.0), 0, np.zeros(10))
+    start = sewing_starts(sheet, posed)[0]
+    assert start.narrow < 1.0  # else its sides pass through the arms
+    pos = start.placed(sheet)
+    assert {frozenset({"left arm"}), frozenset({"right arm"})} <= {
+        limbs_in(pos[loop], posed) for loop in boundary_loops(sheet.faces)
+    }
+    moved = replace(sheet, pos=sheet.pos * [1.0, 1.0, 4.0] + [0.0, 0.25, 0.0])  # far from the body
+    assert np.abs(sewing_starts(moved, posed)[0].placed(moved) - pos).max() < 0.2
+
+
 def test_openings_around_other_limbs_are_told(tmp_path: Path, body: Body) -> None:
     posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
     joint = dict(zip(JOINTS, joints_of(posed), strict=False))
-    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    quads = [[k, (k + 1) % 16, 16 + k] for k in range(16)] + [[(k + 1) % 16, 16 + (k + 1) % 16, 16 + k] for k in range(16)]
-    faces = np.array(quads)
-
-    def tube(x: float) -> np.ndarray:
-        ring = np.stack([0.12 * np.cos(angle), 0.0 * angle, 0.12 * np.sin(angle)], axis=1)
-        knee = joint["left_knee"] * [0.0, 1.0, 1.0] + [x, 0.0, 0.0]
-        return np.concatenate([ring + knee + [0.0, 0.1, 0.0], ring + knee - [0.0, 0.1, 0.0]])
-
-    left, right = tube(joint["left_knee"][0]), tube(joint["right_knee"][0])
-    cloth = build_cloth(left, faces, Material(), dtype=torch.float64)
+    left, faces, cut = _tube(joint["left_knee"], 0.12)
+    right = _tube(joint["left_knee"] * [-1.0, 1.0, 1.0], 0.12)[0]
+    cloth = build_cloth(left, faces, Material(), dtype=torch.float64, flat=cut)
     none = np.zeros(len(left), dtype=bool)
-    assert judged(cloth, faces, posed, left, left, none, 0.0).swapped == ()
-    told = judged(cloth, faces, posed, left, right, none, 0.0)
+    assert judged(cloth, faces, posed, cut, left, left, none, 0.0).swapped == ()
+    told = judged(cloth, faces, posed, cut, left, right, none, 0.0)
     assert told.swapped == ("the left leg, not the right leg",) * 2
     assert told.faults == ["an opening holds the left leg, not the right leg; another the left leg, not the right leg"]

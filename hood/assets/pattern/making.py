@@ -8,9 +8,9 @@ file, angles in degrees; other programs pass it over:
   counter-clockwise; ``"bending"`` of a fold is a factor on the stiffness there;
 - an edge: ``"hood": {"elastic": 0.85, "bending": 3, "width": 2}``, the same of the cloth within a width of it, such as a hem;
 - a side of a stitch: ``{"panel": "cuff", "edge": 0, "hood": {"angle": 150, "bending": 4}}``, the angle of a seam as its first
-  panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons so far
-  from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches 3 below
-  the first.
+  panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons
+  so far from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches 3
+  below the first.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class EdgeMaking:
 
 @dataclass(frozen=True)
 class Fastener:
-    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres; of 0 a zip,
-    all of them. The second one reaches ``overlap`` [m] below the first."""
+    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres;
+    of 0 a zip, all of them. The second one reaches ``overlap`` [m] below the first."""
 
     row: str
     every: float = 0.0
@@ -122,37 +122,32 @@ def stitch_making(
     return angle, bending, fastener
 
 
-def written_panel(panel: PatternPanel) -> dict[str, Any]:
-    """The key ``hood`` of a panel in a file in centimetres, as :func:`panel_making` reads it; empty where there is none. So do
-    the next two."""
-    own: dict[str, Any] = {} if panel.elastic == (1.0, 1.0) else {"elastic": list(panel.elastic)}
-    if panel.folds:
-        own["folds"] = [
-            {
-                "from": [round(100.0 * float(x), 10) for x in fold.start],
-                "to": [round(100.0 * float(x), 10) for x in fold.end],
-                "angle": float(np.degrees(fold.angle)),
-                "bending": fold.bending,
-            }
-            for fold in panel.folds
-        ]
-    return {"hood": own} if own else {}
+def written(piece: PatternPanel | EdgeMaking | Stitch | Fold) -> dict[str, Any]:
+    """What the key ``hood`` of a panel, an edge or a side of a stitch says, in centimetres; nothing where it is made as any.
+
+    Numbers are rounded to 10 digits: degrees that were read are those that are written.
+    """
+    made: dict[str, Any] = {}
+    for name, value in vars(piece).items():
+        if name == "elastic" and value not in (1.0, (1.0, 1.0)):
+            made[name] = value if isinstance(value, float) else list(value)
+        elif (name == "bending" and value != 1.0) or (name == "width" and value != _HEM):
+            made[name] = round(value * (100.0 if name == "width" else 1.0), 10)
+        elif name == "angle" and value is not None:
+            made[name] = round(float(np.degrees(value)), 10)
+        elif name == "folds" and value:
+            made[name] = [
+                {"from": in_centimetres(fold.start), "to": in_centimetres(fold.end), **written(fold)["hood"]} for fold in value
+            ]
+        elif name == "fastener" and value is not None:
+            made[name] = value.row
+            made |= {key: round(100.0 * getattr(value, key), 10) for key in _OF_FASTENER if getattr(value, key)}
+    return {"hood": made} if made else {}
 
 
-def written_edge(making: EdgeMaking) -> dict[str, Any]:
-    own = {"elastic": making.elastic, "bending": making.bending, "width": round(100.0 * making.width, 10)}
-    return {} if making == EdgeMaking() else {"hood": own}
-
-
-def written_stitch(stitch: Stitch) -> dict[str, Any]:
-    own: dict[str, Any] = {} if stitch.angle is None else {"angle": float(np.degrees(stitch.angle))}
-    if stitch.bending != 1.0:
-        own["bending"] = stitch.bending
-    if stitch.fastener is not None:
-        own["fastener"] = stitch.fastener.row
-        lengths = {key: round(100.0 * getattr(stitch.fastener, key), 10) for key in _OF_FASTENER}
-        own |= {key: length for key, length in lengths.items() if length}
-    return {"hood": own} if own else {}
+def in_centimetres(point: np.ndarray) -> list[float]:
+    """A point [m] as it is written: a picometre is less than its rounding."""
+    return [round(100.0 * float(value), 10) + 0.0 for value in point]
 
 
 def _made(where: str, own: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:

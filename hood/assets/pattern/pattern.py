@@ -26,11 +26,10 @@ from hood.assets.pattern.making import (
     Fastener,
     Fold,
     edge_making,
+    in_centimetres,
     panel_making,
     stitch_making,
-    written_edge,
-    written_panel,
-    written_stitch,
+    written,
 )
 from hood.assets.pattern.riding import Patch, patches_of, written_patches
 
@@ -365,19 +364,19 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
             warnings.simplefilter("ignore")  # of turns for which several triples of angles stand
             angles = Rotation.from_matrix(panel.rotation).as_euler("xyz", degrees=True)
         panels[name] = {
-            "translation": _rounded(100.0 * panel.translation),
-            "rotation": _rounded(angles),
-            "vertices": [_rounded(100.0 * edge.start) for edge in panel.edges],
+            "translation": in_centimetres(panel.translation),
+            "rotation": [round(float(angle), 10) + 0.0 for angle in angles],
+            "vertices": [in_centimetres(edge.start) for edge in panel.edges],
             "edges": edges,
             "label": panel.label,
-            **written_panel(panel),
+            **written(panel),
         }
         if panel.patches:
             panels[name]["hood"] = panels[name].get("hood", {}) | written_patches(panel)
     stitches: list[list[Any]] = []
     for stitch in pattern.stitches:
         sides: list[Any] = [{"panel": name, "edge": place} for name, place in (stitch.first, stitch.second)]
-        sides[0] |= written_stitch(stitch)
+        sides[0] |= written(stitch)
         stitches.append([*sides, "right_wrong"] if stitch.same else sides)
     properties = {"units_in_meter": 100, "curvature_coords": "relative", "normalize_panel_translation": False}
     properties["body_height"] = round(100.0 * pattern.height, 10)
@@ -390,13 +389,8 @@ def write_pattern(path: Path, pattern: Pattern) -> None:
     write_atomically(Path(path), (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _rounded(values: np.ndarray) -> list[float]:
-    """Numbers as they are written: a picometre is less than their rounding."""
-    return [round(float(value), 10) + 0.0 for value in values]
-
-
 def _written(where: str, number: int, count: int, edge: Edge) -> dict[str, Any]:
-    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count], **written_edge(edge.making)}
+    content: dict[str, Any] = {"endpoints": [number, (number + 1) % count], **written(edge.making)}
     if edge.arc is not None:
         radius, large, right = edge.arc
         content["curvature"] = {"type": "circle", "params": [100.0 * radius, int(large), int(right)]}

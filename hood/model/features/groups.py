@@ -216,7 +216,7 @@ class RestRelative(EdgeGroup):
     width, places = 4, True
 
     def forward(self, inputs: Inputs) -> Tensor:
-        return inputs.edges.once("rest", lambda: with_norm(cloth_difference(inputs.cloth.rest_pos, inputs)))
+        return inputs.edges.once("rest and norm", lambda: with_norm(inputs.rest))
 
 
 class EdgeTimestep(EdgeGroup):

@@ -168,7 +168,7 @@ class Inputs:
         cloth, sets = self.cloth, [self.graph.edge_sets[name] for name in self.cloth_sets]
         of_sets = [x for s in sets for x in (s.senders, s.receivers, s.source)]
         of_cloth = [cloth.rest_pos, cloth.vertex_scene, cloth.vertex_fabric, cloth.edge_fabric]
-        of_cloth += [cloth.mass, cloth.pinned, self.graph.node_level]
+        of_cloth += [cloth.mass, cloth.pinned, self.graph.node_level, *([] if cloth.flat is None else [cloth.flat])]
         if torch.is_inference_mode_enabled() or any(x.requires_grad for x in of_cloth):
             return self.make_edge_rows()  # of no use to a later step: inference tensors, or a graph already walked
         key = [(x, x._version) for x in of_sets + of_cloth]
@@ -177,6 +177,13 @@ class Inputs:
                 return rows
         _recent_rows.append((key, self.make_edge_rows()))
         return _recent_rows[-1][1]
+
+    @property
+    def rest(self) -> Tensor:
+        """(N, 3) m: all cloth edges at rest, see :func:`rest_vectors`."""
+        return self.edges.once(
+            "rest", lambda: torch.cat([rest_vectors(self.cloth, self.graph, name) for name in self.cloth_sets])
+        )
 
     def make_edge_rows(self) -> EdgeRows:
         """The table :attr:`edges`, made anew."""
@@ -202,3 +209,14 @@ class Inputs:
             return ends
         own = (edges.source < self.graph.num_mesh_edges).unsqueeze(1)
         return torch.where(own, self.cloth.edge_fabric[edges.source.clamp_max(self.graph.num_mesh_edges - 1)], ends)
+
+
+def rest_vectors(cloth: Cloth, graph: Graph, name: str) -> Tensor:
+    """(N, 3) m: the edges of a set at rest, from receiver to sender; those of a mesh are as long as in its flat pattern."""
+    edges, pos = graph.edge_sets[name], cloth.rest_pos
+    vector = pos.index_select(0, edges.senders) - pos.index_select(0, edges.receivers)
+    if cloth.flat is None or name != MESH or edges.num_edges == 0:
+        return vector
+    own, last = (edges.source < graph.num_mesh_edges).unsqueeze(1), graph.num_mesh_edges - 1
+    length = cloth.rest_length.index_select(0, edges.source.clamp_max(last)).unsqueeze(1)
+    return torch.where(own, vector * (length / vector.norm(dim=1, keepdim=True)), vector)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hood.model.features.feature_set import FeatureSet
 from hood.model.features.groups import EdgeGroup, NodeGroup, cloth_difference
-from hood.model.features.inputs import Inputs
+from hood.model.features.inputs import Inputs, rest_vectors
 from hood.model.features.normalizer import FixedScale
 from hood.model.features.physical import GRAVITY, ContactDistance, Residual, edge_length, mean_rest_length, physical
 from hood.native import features as native
@@ -153,7 +153,8 @@ def local(
 def _strain(inputs: Inputs, name: str) -> Tensor:
     """asinh(100·(length/rest length − 1)) of the edges (N, 1) at the base; 0 for edges of no rest length."""
     rows = inputs.graph.edge_sets[name]
-    now, rest = (edge_length(pos[rows.senders] - pos[rows.receivers]) for pos in (inputs.base, inputs.cloth.rest_pos))
+    now = edge_length(inputs.base[rows.senders] - inputs.base[rows.receivers])
+    rest = edge_length(rest_vectors(inputs.cloth, inputs.graph, name))
     proper = rest > 1e-6
     return torch.asinh(GAIN * torch.where(proper, now / torch.where(proper, rest, 1.0) - 1, 0.0))
 

@@ -165,7 +165,7 @@ class ScaledShape(EdgeGroup):
     width = 8
 
     def forward(self, inputs: Inputs) -> Tensor:
-        current, rest = cloth_difference(inputs.state.pos, inputs), cloth_difference(inputs.cloth.rest_pos, inputs)
+        current, rest = cloth_difference(inputs.state.pos, inputs), inputs.rest
         columns = torch.cat([current, edge_length(current), rest, edge_length(rest)], dim=1)
         return columns / inputs.edges.once("mean length", lambda: mean_rest_length(inputs))
 
@@ -235,7 +235,7 @@ def edge_length(vector: Tensor) -> Tensor:
 
 def rest_length(inputs: Inputs) -> Tensor:
     """Rest lengths of the cloth edges [m], (N, 1)."""
-    return edge_length(cloth_difference(inputs.cloth.rest_pos, inputs))
+    return edge_length(inputs.rest)
 
 
 def mean_rest_length(inputs: Inputs) -> Tensor:

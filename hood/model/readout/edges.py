@@ -39,6 +39,7 @@ from hood.cloth.cloth import Cloth
 from hood.contact.contact import Contact
 from hood.contact.sample_points import chord_error
 from hood.energies.problem import StepProblem
+from hood.model.features.inputs import rest_vectors
 from hood.model.graph.builder import MESH, EdgeSet, Graph
 from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep
 from hood.model.readout.output import DEEPEST, VelocityBaseOutput
@@ -237,8 +238,7 @@ class EdgeOutput(VelocityBaseOutput):
 
     def vectors(self, problem: StepProblem, graph: Graph, vector: Tensor, raw: Tensor) -> Tensor:
         """What the edges (N, 3) [m] of the base become: the same in both directions, but for the sign."""
-        edges, rest_pos = graph.edge_sets[MESH], problem.cloth.rest_pos
-        rest = (rest_pos.index_select(0, edges.receivers) - rest_pos.index_select(0, edges.senders)).norm(dim=1, keepdim=True)
+        edges, rest = graph.edge_sets[MESH], rest_vectors(problem.cloth, graph, MESH).norm(dim=1, keepdim=True)
         other = raw.index_select(0, edges.reverse)
         turned = vector + 0.5 * _TURN * rest * (raw[:, :3] - other[:, :3])
         share, stretch = (0.5 * (raw[:, 3:] + other[:, 3:])).split(1, dim=1)

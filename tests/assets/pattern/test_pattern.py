@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 from sewing_patterns import PATTERNS, panel, skirt, specification, write
 
 from hood.assets.material import Material
-from hood.assets.pattern.making import EdgeMaking, with_elastic
+from hood.assets.pattern.making import with_elastic
 from hood.assets.pattern.pattern import Edge, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
@@ -281,31 +282,25 @@ def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], messa
         _sheet(tmp_path, _made(**hood))
 
 
-@pytest.mark.parametrize(
-    ("place", "own"),
-    [
-        ("panel", {"elastic": [0.9, 1.1], "folds": [{"from": [0, 0], "to": [0, 10], "angle": 150, "bending": 4}]}),
-        ("edge", {"elastic": 0.8, "bending": 3, "width": 4}),
-        ("stitch", {"angle": 90, "bending": 5}),
-        ("stitch", {"fastener": "side_zip"}),
-        ("stitch", {"fastener": "side_buttons", "every": 8, "overlap": 3}),
-    ],
-)
-def test_what_it_says_of_making_is_written(place: str, own: dict[str, Any], tmp_path: Path) -> None:
+def test_how_a_pattern_is_made_is_written(tmp_path: Path) -> None:
     content = skirt()
-    panel = content["pattern"]["panels"]["front"]
-    {"panel": panel, "edge": panel["edges"][0], "stitch": content["pattern"]["stitches"][0][0]}[place]["hood"] = own
-    first, second = tmp_path / "skirt.json", tmp_path / "again.json"
-    pattern = read_pattern(write(first, content))
-    write_pattern(second, pattern)
-    again = read_pattern(second)
-    if place == "stitch":
-        assert again.stitches[0] != read_pattern(write(first, skirt())).stitches[0]
-        assert again.stitches == pattern.stitches
-    elif place == "edge":
-        assert again.panels["front"].edges[0].making == EdgeMaking(0.8, 3.0, 0.04)
-    else:
-        fold = again.panels["front"].folds[0]
-        assert again.panels["front"].elastic == (0.9, 1.1)
-        np.testing.assert_allclose([*fold.start, *fold.end], [0.0, 0.0, 0.0, 0.1], atol=1e-12)
-        assert (fold.angle, fold.bending) == (pytest.approx(np.radians(150.0)), 4.0)
+    own = content["pattern"]["panels"]["front"]
+    says = [
+        (own, {"elastic": [0.85, 1.1], "folds": [{"from": [-3, 10.3], "to": [3.1, 30], "angle": 150, "bending": 2}]}),
+        (own["edges"][0], {"elastic": 0.7, "bending": 3, "width": 1.7}),
+        (own["edges"][1], {"width": 4}),
+        (content["pattern"]["stitches"][0][0], {"angle": -33.3, "bending": 4, "fastener": "side", "every": 8, "overlap": 3}),
+    ]
+    for table, made in says:
+        table["hood"] = made
+    pattern = read_pattern(write(tmp_path / "skirt.json", content))
+    write_pattern(tmp_path / "again.json", pattern)
+    again = json.loads((tmp_path / "again.json").read_text(encoding="utf-8"))["pattern"]
+    front = again["panels"]["front"]
+    kept = [front["hood"], front["edges"][0]["hood"], front["edges"][1]["hood"], again["stitches"][0][0]["hood"]]
+    assert kept == [made for _, made in says]
+    assert json.dumps(again).count('"hood"') == 4
+    other = read_pattern(tmp_path / "again.json")
+    sheets = [sheet_of(one, 0.04, "skirt").made for one in (pattern, other)]
+    for name, table in vars(sheets[0]).items():
+        assert np.allclose(table, vars(sheets[1])[name], rtol=1e-9, equal_nan=True)

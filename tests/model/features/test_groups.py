@@ -222,3 +222,26 @@ def test_the_contract_notices_what_a_group_promises_and_does_not_keep():
     Place.width = 2
     with pytest.raises(AssertionError, match="Place: .* instead of"):
         assert_feature_group_contract(Place())
+
+
+def test_rest_lengths_are_those_of_the_flat_pattern() -> None:
+    plain = make_inputs()
+    edges = plain.edges
+    faces = plain.cloth.faces.numpy()
+    same, longer = (size * REST.numpy()[faces][..., [0, 2]] for size in (1.0, 1.25))
+    lengths = {}
+    for name, flat in (("none", None), ("same", same), ("longer", longer)):
+        cloth = build_cloth(REST.numpy(), faces, FABRIC, torch.arange(4) == 3, dtype=torch.float64, flat=flat)
+        inputs = replace(plain, cloth=cloth)
+        strain = physical.Strain(gain=1.0)
+        lengths[name] = groups.RestRelative()(inputs), strain(inputs)[:, 0], local._strain(inputs, "mesh"), inputs.rest
+    assert torch.equal(lengths["none"][3], REST[edges.senders] - REST[edges.receivers])
+    for one, other in zip(lengths["none"], lengths["same"], strict=True):
+        assert torch.allclose(one, other)
+    mesh = plain.graph.edge_sets["mesh"].num_edges
+    grown, before = lengths["longer"], lengths["none"]
+    factor = torch.where(torch.arange(len(edges.senders)) < mesh, 1.25, 1.0).unsqueeze(1)  # coarse edges are no threads
+    assert mesh < len(edges.senders)
+    assert torch.allclose(grown[0], factor * before[0])
+    assert torch.allclose(torch.sinh(grown[1]) + 1.0, (torch.sinh(before[1]) + 1.0) / factor[:, 0])
+    assert torch.allclose((torch.sinh(grown[2]) / 100.0 + 1.0) * 1.25, torch.sinh(before[2]) / 100.0 + 1.0)
