@@ -25,14 +25,13 @@ from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.fronts import opened
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
-from hood.cloth.state import Obstacle, State, StepInput
+from hood.cloth.state import Attachments, Obstacle, State, StepInput
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
 from hood.rollouts.sewn import Sewn, held_limbs, joints_of, judged, limbs_in
-from hood.scene.holding import fastening_of
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
@@ -355,8 +354,9 @@ class _Work:
             faces = np.concatenate([faces, squares + len(skin)])
             skin, thin = np.concatenate([skin, points]), np.concatenate([thin, points])
         self.skin, self.thin, self.body_faces = (torch.as_tensor(table) for table in (skin, thin, faces))
-        self.closed, fastening = sheet.closed, fastening_of(sheet.rows, torch.as_tensor(self.begun))
-        self.fastened = fastening and replace(fastening.pairs, length=torch.full_like(fastening.pairs.length, ROOM), speed=None)
+        pairs = torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *sheet.rows.values()]))
+        room = torch.full((len(pairs),), ROOM, dtype=torch.float64)
+        self.closed, self.fastened = sheet.closed, Attachments(pairs, pairs[:, 0] >= 0, room) if len(pairs) else None
         self.progress = ProgressLines("sewing")
         self._growth = start.growth / max(float((self.skin - self.thin).norm(dim=1).max()), 1e-9)
 

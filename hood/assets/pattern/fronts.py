@@ -60,7 +60,8 @@ def _divide(t: Table, name: str, fastener: Fastener, placket: EdgeMaking) -> Non
     starts = np.array([edge.start for edge in panel.edges])
     ends = np.flatnonzero(np.abs(starts[:, 0]) < _MIDDLE)
     low, high = ends[np.argsort(starts[ends, 1])]
-    count, moved = len(keys), {}
+    moved: dict[tuple[str, int], tuple[str, int]] = {}
+    count = len(keys)
     for side, first, last in (("left", low, high), ("right", high, low)):
         own = [(first + k) % count for k in range((last - first) % count)]
         cut = Edge(starts[last], starts[first], np.zeros((0, 2)), making=placket)
