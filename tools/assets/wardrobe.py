@@ -43,6 +43,7 @@ WARDROBE = {
     "hoodie": Piece("hoodie"),
     "poncho": Piece("poncho"),
     "cape": Piece("cape"),
+    "apron": Piece("apron"),
     "jeans": Piece("jeans"),
     "leggings": Piece("leggings"),
     "jumpsuit": Piece("jumpsuit"),
@@ -50,6 +51,7 @@ WARDROBE = {
     "sheath": Piece("sheath"),
     "circle": Piece("circle", {"length": 0.45}),
     "pleated": Piece("pleated"),
+    "wrap": Piece("wrap"),
     "tiered": Piece("tiered"),
 }
 
