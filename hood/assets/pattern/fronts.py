@@ -17,9 +17,9 @@ from hood.assets.pattern.blocks import XY, Place, Side, SideKey, Table, both_hal
 from hood.assets.pattern.making import EdgeMaking, Fastener, Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import Edge, Stitch
-from hood.assets.pattern.sheet import PatternSheet, in_triangles
+from hood.assets.pattern.sheet import PatternSheet
 from hood.mesh import geometry, topology
-from hood.mesh.flat import SIDE_TABLES, Construction
+from hood.mesh.flat import SIDE_TABLES, Construction, in_triangles
 
 #: What an opening may be closed by: rows of fasteners, and what lies below them.
 CLOSED = {"buttons": Fastener("front_buttons", 0.08, 0.03), "zip": Fastener("front_zip", 0.0, 0.02)}

@@ -316,9 +316,11 @@ def band_along(flat: np.ndarray, faces: np.ndarray, line: np.ndarray, width: flo
     between = np.linspace(0.0, 1.0, count)[:, None, None]
     points = ((1.0 - between) * line[:, 0] + between * line[:, 1]).reshape(-1, 2)
     ways = np.broadcast_to(line[:, 1] - line[:, 0], (count, len(line), 2)).reshape(-1, 2)
-    tree = cKDTree(points)
-    distance, nearest = tree.query(flat.mean(axis=1))
-    start, end = np.roll(flat, -1, axis=1), np.roll(flat, -2, axis=1)
+    tree, own = cKDTree(points), flat[faces]
+    distance, nearest = tree.query(own.mean(axis=1))
+    start, end = np.roll(own, -1, axis=1), np.roll(own, -2, axis=1)
     along = np.concatenate([(1.0 - s) * start + s * end for s in np.linspace(0.0, 1.0, _SAMPLES)], axis=1)
-    near = (tree.query(along)[0] <= (1.0 + _ROUND) * width).reshape(len(flat), _SAMPLES, 3).mean(axis=1)
-    return Band(faces & (distance <= width), ways[nearest], np.where(faces[:, None], near, 0.0))
+    near = (tree.query(along)[0] <= (1.0 + _ROUND) * width).reshape(len(own), _SAMPLES, 3).mean(axis=1)
+    inside, way, share = faces.copy(), np.zeros((len(flat), 2)), np.zeros((len(flat), 3))
+    inside[faces], way[faces], share[faces] = distance <= width, ways[nearest], near
+    return Band(inside, way, share)

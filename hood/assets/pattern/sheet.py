@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay, cKDTree
 from hood.assets.pattern.making import Fastener, construction_of, folded
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
-from hood.mesh.flat import Construction
+from hood.mesh.flat import Construction, in_triangles
 
 #: Points inside a panel keep this share of the edge length from its outline.
 _FROM_OUTLINE = 0.6
@@ -23,8 +23,8 @@ _ON_OUTLINE, _AT_CORNER, _FINE = 2e-3, 0.25, 257
 _HALVED = 5
 #: Between panels that lie side by side in the texture [m].
 _MARGIN = 0.02
-#: Points of a curve that tell how far it reaches; and pairs of points and triangles that are looked at at once.
-_CURVED, _AT_ONCE = 32, 1 << 21
+#: Points of a curve that tell how far it reaches.
+_CURVED = 32
 #: No pairs.
 _NONE = np.zeros((0, 2), dtype=np.int64)
 
@@ -125,15 +125,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         owner.append(np.full(len(triangles), number))
         start += len(points)
     pos, corners, of_panel = np.concatenate(placed), np.concatenate(faces), np.concatenate(owner)
-    pairs, fastened = [_NONE], []
-    for stitch in pattern.stitches:
-        first, second = outlines[stitch.first], outlines[stitch.second]
-        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
-        if stitch.fastener is None:
-            pairs.append(pair)
-        else:
-            fastened.append((stitch.fastener, pair))
-    joins = np.concatenate(pairs)
+    joins, fastened = _joined(pattern, outlines)
     joined = np.concatenate([joins, *(pair for _, pair in fastened)])
     label = topology.connected_components(start, joined)
     _, welds = np.unique(label, return_inverse=True)
@@ -155,7 +147,22 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     sewn = PatternSheet(
         middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
     )
-    return replace(sewn, joins=joins, fastened=tuple(fastened))
+    return replace(sewn, joins=joins, fastened=fastened)
+
+
+def _joined(
+    pattern: Pattern, outlines: Mapping[tuple[str, int], np.ndarray]
+) -> tuple[np.ndarray, tuple[tuple[Fastener, np.ndarray], ...]]:
+    """``joins`` and ``fastened`` of a sheet."""
+    pairs, fastened = [_NONE], []
+    for stitch in pattern.stitches:
+        first, second = outlines[stitch.first], outlines[stitch.second]
+        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
+        if stitch.fastener is None:
+            pairs.append(pair)
+        else:
+            fastened.append((stitch.fastener, pair))
+    return np.concatenate(pairs), tuple(fastened)
 
 
 def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
@@ -194,19 +201,6 @@ def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.
 def _along(way: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """``values`` (K, n) at the places ``way`` (K,), read between them (N, n)."""
     return np.stack([np.interp(wanted, way, column) for column in values.T], axis=1)
-
-
-def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
-    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
-        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
-        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
-        face[rows] = bary.min(axis=2).argmax(axis=1)
-        weights[rows] = bary[np.arange(len(rows)), face[rows]]
-    weights = weights.clip(min=0.0)
-    return face, weights / weights.sum(axis=1, keepdims=True)
 
 
 #: Where ends of folds lie on the outline of a panel: (side, share of its length); None: inside.

@@ -12,7 +12,7 @@ import torch
 from sewing_patterns import PATTERNS, panel, skirt, specification, write
 
 from hood.assets.material import Material
-from hood.assets.pattern.making import with_elastic
+from hood.assets.pattern.making import EdgeMaking, with_elastic
 from hood.assets.pattern.pattern import Edge, read_pattern, write_pattern
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
@@ -279,6 +279,21 @@ def test_a_fold_keeps_its_side_where_its_panel_is_turned_over(tmp_path: Path) ->
 def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         _sheet(tmp_path, _made(**hood))
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"every": 8}, r"hood.every is 8 without a fastener; name its row"),
+        ({"fastener": "front zip"}, r"hood.fastener is 'front zip'; give the name of a row"),
+        ({"fastener": "zip", "overlap": 0.2}, r"hood.overlap is 0.2; give a number from 0.5 to 100"),
+    ],
+)
+def test_a_fastener_that_cannot_be_is_told(tmp_path: Path, own: dict[str, Any], message: str) -> None:
+    content = skirt()
+    content["pattern"]["stitches"][0][0]["hood"] = own
+    with pytest.raises(ValueError, match=f"stitch 0: {message}"):
+        _sheet(tmp_path, content)
 
 
 @pytest.mark.parametrize(
