@@ -36,15 +36,21 @@ class Piece(NamedTuple):
 
 
 WARDROBE = {
-    "circle": Piece("circle", {"length": 0.45}),
-    "tiered": Piece("tiered"),
-    "sheath": Piece("sheath"),
-    "swing": Piece("swing"),
+    "blouse": Piece("blouse"),
+    "blazer": Piece("blazer"),
+    "bomber": Piece("bomber"),
+    "gilet": Piece("gilet"),
     "hoodie": Piece("hoodie"),
-    "leggings": Piece("leggings"),
-    "jumpsuit": Piece("jumpsuit"),
     "poncho": Piece("poncho"),
     "cape": Piece("cape"),
+    "jeans": Piece("jeans"),
+    "leggings": Piece("leggings"),
+    "jumpsuit": Piece("jumpsuit"),
+    "swing": Piece("swing"),
+    "sheath": Piece("sheath"),
+    "circle": Piece("circle", {"length": 0.45}),
+    "pleated": Piece("pleated"),
+    "tiered": Piece("tiered"),
 }
 
 

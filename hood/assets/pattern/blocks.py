@@ -165,13 +165,7 @@ def band(t: Table, m: Measures, edges: Mapping[bool, Sequence[SideKey]], height:
 
 
 def tiers(
-    t: Table,
-    m: Measures,
-    edges: Mapping[bool, Sequence[SideKey]],
-    top: float,
-    length: float,
-    count: int,
-    gathers: float,
+    t: Table, m: Measures, edges: Mapping[bool, Sequence[SideKey]], top: float, length: float, count: int, gathers: float
 ) -> None:
     """Rows of gathered cloth below edges of the front (False) and of the back (True)."""
     for number in range(1, count + 1):
@@ -225,10 +219,15 @@ def _fitted(below: XY, low: XY, high: XY, waist: XY, fit: float) -> tuple[XY, ..
 
 
 def _onward(below: XY, low: XY, high: XY) -> tuple[XY, XY]:
-    """Control points of a side that goes on from ``below`` at ``low`` and bends to ``high``, where a waist is."""
-    rise = high[1] - low[1]
-    lean = (low[0] - below[0]) / (low[1] - below[1])
+    """Control points of a side that goes on from ``below`` at ``low``, but not outwards, and bends to a waist at ``high``."""
+    rise, lean = high[1] - low[1], min((low[0] - below[0]) / (low[1] - below[1]), 0.0)
     return (low[0] + 0.35 * rise * lean, low[1] + 0.35 * rise), (high[0] + 0.3 * (low[0] - high[0]), high[1] - 0.35 * rise)
+
+
+def _inward(low: XY, high: XY) -> tuple[XY, ...]:
+    """Control points of a side that comes upright to ``high`` from ``low`` farther in; none from farther out."""
+    third, rise = (high[0] - low[0]) / 3.0, high[1] - low[1]
+    return ((low[0] + third, low[1] + rise / 3.0), (high[0], high[1] - 0.35 * rise)) if third > 0.0 else ()
 
 
 def _dart(width: float) -> float:
@@ -361,7 +360,7 @@ def skirt(t: Table, m: Measures, ease: float, length: float, flare: float, piece
     corner = (low, hem + 0.15 * (low - hip))
     half = [
         Side("hem", (0.0, hem), ((0.6 * low, hem),)),
-        Side("side0", corner),
+        Side("side0", corner, _inward(corner, (hip, m.hip_height))),
         Side("side1", (hip, m.hip_height), _onward(corner, (hip, m.hip_height), (side, top)) if flare < 0.3 else ()),
         Side("waist1", (side, top)),
         *([Side("dart_a", (inner + dart, top)), Side("dart_b", apex)] if dart else []),
@@ -414,6 +413,7 @@ def legs(t: Table, m: Measures, leg: Leg) -> None:
         inseam = inner(fork).length
         low_end = Side("outer0", (hem_out, low)), Side("outer1", (outer, m.knee_height))
         sides = [Side("hem", (hem_out - wide - more, low)), *(low_end if bends else [Side("outer1", (hem_out, low))])]
+        sides[-1] = sides[-1]._replace(curve=_inward(sides[-1].start, (hip, m.hip_height)))
         seat = fork + max(0.08, 1.1 * reach)
         sides += [
             Side("outer2", (hip, m.hip_height), _onward(sides[-1].start, (hip, m.hip_height), side)),

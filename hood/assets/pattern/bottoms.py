@@ -1,4 +1,4 @@
-"""Designs that hang from the waist: skirts and trousers."""
+"""Designs that hang from the waist: skirts, trousers and an apron."""
 
 from __future__ import annotations
 
@@ -9,7 +9,20 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hood.assets.pattern.blocks import XY, Leg, Side, SideKey, Table, band, draw_strip, legs, skirt, tiers, trunk_place
+from hood.assets.pattern.blocks import (
+    XY,
+    Leg,
+    Side,
+    SideKey,
+    Table,
+    band,
+    both_halves,
+    draw_strip,
+    legs,
+    skirt,
+    tiers,
+    trunk_place,
+)
 from hood.assets.pattern.making import Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.options import Choices, Design, Options, entered
@@ -22,8 +35,8 @@ BOTTOMS: dict[str, Design] = {}
 _AROUND = {"back_right": -135.0, "front_right": -45.0, "front_left": 45.0, "back_left": 135.0}
 #: Pleats are folded by so much [rad] at rest, and stiffer there by this factor.
 _LAID, _CREASE = math.radians(165.0), 5.0
-#: Rows of stitches are so wide [m].
-_STITCHES = 5e-3
+#: Rows of stitches, and straps, are so wide [m]; of two panels in front the outer one begins so much farther out.
+_STITCHES, _STRAP, _LAYER = 5e-3, 0.035, 0.03
 
 
 def gores(t: Table, ring: float, circle: float, length: float, top: XY, least: float = 0.0) -> None:
@@ -181,6 +194,108 @@ def _pleated(t: Table, m: Measures, o: Options) -> None:
     halves = {False: names[1:3], True: [names[3], names[0]]}
     edges = {back: [side for name in own for side in t.keys(name, "waist")] for back, own in halves.items()}
     band(t, m, edges, o.band, m.waist_height + o.band)
+
+
+@entered(
+    BOTTOMS,
+    ease=(0.05, 0.02, 0.3),
+    length=(0.5, 0.3, 0.95),
+    flare=(0.35, 0.3, 1.0),
+    overlap=(0.6, 0.2, 0.85),
+    band=(0.035, 0.03, 0.08),
+)
+def _wrap(t: Table, m: Measures, o: Options) -> None:
+    """The two fronts meet in one point of the waist and overlap below it: both in one seam of the band are three layers."""
+    plain, top = Table(), m.waist_height
+    skirt(plain, m, o.ease, o.length, o.flare, _quarter(m.waist), top)
+    names = ["hem", "side0", "side1", "waist1", "waist0"]
+    front = _keyed(plain.panels["skirt_front"], [f"left_{name}" for name in names] + [f"right_{name}" for name in names[::-1]])
+    back = _keyed(plain.panels["skirt_back"], [f"right_{name}" for name in names] + [f"left_{name}" for name in names[::-1]])
+    half, (_, low) = front["left_side0"].start[0], front["left_hem"].start
+    angles, (_, _, z) = trunk_place(m, False)
+
+    def corner(x: float) -> XY:
+        """The lower end of a free edge, which is as long as the middle is."""
+        return x, top - math.sqrt((top - low) ** 2 - (x - front["left_waist0"].start[0]) ** 2)
+
+    outer, inner = corner(o.overlap * half), corner(-0.5 * o.overlap * half)
+    over = [front["right_hem"], Side("over_hem", (0.0, low), ((0.5 * outer[0], low),)), Side("edge", outer)]
+    over += [front["left_waist0"], *(front[f"right_{name}"] for name in names[:0:-1])]
+    under = [Side("under_hem", inner, ((0.5 * inner[0], low),)), *(front[f"left_{name}"] for name in names[:-1])]
+    t.draw("skirt_front_over", over, angles, (0.0, 0.0, z + _LAYER))
+    t.draw("skirt_front_under", [*under, Side("edge", front["left_waist0"].start)], angles, (0.0, 0.0, z))
+    t.draw("skirt_back", list(back.values()), *trunk_place(m, True))
+    for name in ("skirt_front_over", "skirt_front_under"):
+        t.sew_keys(name, "skirt_back", ["side"])
+    edges = [*t.keys("skirt_front_over", "waist"), *t.keys("skirt_front_under", "waist")]
+    band(t, m, {False: edges, True: t.keys("skirt_back", "waist")}, o.band, top + o.band)
+
+
+def _keyed(panel: PatternPanel, keys: Sequence[str]) -> dict[str, Side]:
+    """The sides of a panel by keys that are given in their order."""
+    return {
+        key: Side(key, (float(edge.start[0]), float(edge.start[1])), tuple((float(x), float(y)) for x, y in edge.curve))
+        for key, edge in zip(keys, panel.edges, strict=True)
+    }
+
+
+@entered(
+    BOTTOMS,
+    length=(0.4, 0.2, 0.8),
+    flare=(0.15, 0.0, 0.6),
+    bib=(0.6, 0.45, 0.75),
+    straps=("neck", "back"),
+    band=(0.04, 0.03, 0.08),
+)
+def _apron(t: Table, m: Measures, o: Options) -> None:
+    """Open behind, below a waistband that is closed there as its tie is."""
+    low, size, behind = m.waist_height, m.height / 1.72, o.straps == "back"
+    waist, high = low + o.band, low + float(np.clip(m.front_length, m.back_length - 0.01, m.back_length + 0.025))
+    wide, half, hem = 0.3 * m.waist, 0.13 * size, low * (1.0 - o.length)
+    # Where the straps cross the shoulder, and the upper edge of the bib.
+    inner, outer = np.array([m.neck_width, high]), np.array([0.5 * m.shoulder_width, high - m.neck_height + m.shoulder_height])
+    first = 0.25 if behind else 0.05
+    shares = first, first + _STRAP / float(np.linalg.norm(outer - inner))
+    near, far = ((float(x), float(y)) for x, y in (inner + share * (outer - inner) for share in shares))
+    top, corner = waist + o.bib * (high - waist), max(0.1 * size, far[0])
+    bib = [
+        Side("bottom", (0.0, waist)),
+        Side("open", (half, waist), ((half, waist + 0.5 * (top - waist)),)),
+        Side("strap_out", (corner, top)),
+        Side("shoulder", far),
+        Side("strap_in", near),
+        Side("upper", (corner - _STRAP, top)),
+    ]
+    t.draw("bib_front", both_halves(bib, (0.0, top)), *trunk_place(m, False))
+    skirt_half = [Side("hem", (0.0, hem)), Side("open", (0.3 * m.hips * (1.0 + o.flare), hem)), Side("waist", (wide, low))]
+    t.draw("skirt_front", both_halves(skirt_half, (0.0, low)), *trunk_place(m, False))
+    draw_strip(t, "tie_front", [wide - half, half, half, wide - half], [wide, wide], o.band, low, trunk_place(m, False))
+    rest = 0.2 * m.waist
+    place, gap = trunk_place(m, True), 0.045 * size
+    pieces = [rest - gap - _STRAP, _STRAP, 2.0 * gap, _STRAP, rest - gap - _STRAP] if behind else [2.0 * rest]
+    draw_strip(t, "tie_back", pieces, [2.0 * rest], o.band, low, place)
+    t.sew_keys("tie_front", "tie_back", ["side"])
+    t.sew_all(t.keys("skirt_front", "waist"), t.keys("tie_front", "below"))
+    t.sew_all(t.keys("bib_front", "bottom"), t.keys("tie_front", "above")[1:3])
+    if behind:
+        strap = [Side("bottom", (gap, waist)), Side("out", (gap + _STRAP, waist)), Side("shoulder", far), Side("in", near)]
+        t.draw("right_strap_back", strap, *place)
+        t.mirror("right_strap_back", "left_strap_back")
+        for side, piece in (("left", 1), ("right", 3)):
+            t.sew((f"{side}_strap_back", "bottom"), t.keys("tie_back", "above")[piece])
+            t.sew((f"{side}_strap_back", "shoulder"), ("bib_front", f"{side}_shoulder"))
+    else:
+        deep = high - 0.03
+        loop = [
+            Side("out", (0.0, deep - _STRAP), ((0.9 * far[0], deep - _STRAP),)),
+            Side("shoulder", far),
+            Side("in", near, ((0.9 * near[0], deep),)),
+        ]
+        t.draw("strap_back", both_halves(loop, (0.0, deep), True), *place)
+        t.sew_keys("strap_back", "bib_front", ["shoulder"])
+    x, y, tall = 0.11 * size, low - 0.07 * size, 0.15 * size
+    pocket = Patch("pocket", np.array([(-x, y - tall), (x, y - tall), (x, y), (-x, y)]))
+    t.panels["skirt_front"] = replace(t.panels["skirt_front"], patches=(pocket,))
 
 
 def _trousers_with_band(t: Table, m: Measures, o: Options, knee: float, hem: float) -> None:

@@ -260,9 +260,14 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
 
 
 def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
+<<<<<<< HEAD
     """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are folds that do not meet, one way and back; without, flat.
+=======
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not cross; without, flat.
+>>>>>>> pleats
 
     Args:
+        folds: that run across the panel.
         outer: 1, or -1 for a panel whose outer side is at negative z.
     """
     flat = np.pad(points, ((0, 0), (0, 1)))
@@ -271,6 +276,10 @@ def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarra
     ways = [fold.end - fold.start for fold in folds]
     ways = [way / np.linalg.norm(way) * np.sign(way @ ways[0]) for way in ways]
     across = [np.array([way[1], -way[0]]) for way in ways]
+    ends = np.array([(fold.start, fold.end) for fold in folds])
+    tips = [(ends - fold.start) @ side for fold, side in zip(folds, across, strict=True)]
+    if any(((tip.min(axis=1) < -_SHORTEST) & (tip.max(axis=1) > _SHORTEST)).any() for tip in tips):
+        return flat
     beyond = np.stack([(points - fold.start) @ side for fold, side in zip(folds, across, strict=True)], axis=1) > 0.0
     order = np.argsort([fold.start @ across[0] for fold in folds])
     laid, turn, shift = flat.copy(), np.eye(3), np.zeros(3)

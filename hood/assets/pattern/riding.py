@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _CLOTH, _HIGHER, _BUTTON = 1.5e-3, 5e-4, 3.5e-3
 #: Points of their outlines are at most so far [m] from each other; the foot of a rim is at this share of the height.
 _STEP, _FOOT = 8e-3, 0.1
+#: Less than this [m²] is no triangle.
+_NO_AREA = 1e-9
 #: What a button measures that does not say [m], and the corners of its outline.
 _RADIUS, _CORNERS = 9e-3, 16
 
@@ -124,11 +126,12 @@ def _rider(
     inner = inner[cKDTree(ring).query(inner)[0] > 0.5 * _STEP] if len(inner) and not patch.rigid else inner[:0]
     points = np.concatenate([ring, inner])
     triangles = Delaunay(points).simplices.astype(np.int64)
-    triangles = triangles[inside(points[triangles].mean(axis=1), ring)]
+    area = np.linalg.det(points[triangles][:, 1:] - points[triangles][:, :1])
+    whole = inside(points[triangles].mean(axis=1), ring) & (np.abs(area) > _NO_AREA)
+    triangles, area = triangles[whole], area[whole]
     face, bary = in_triangles(points, flat)
     # Wound as the cloth beneath; and the ring as the triangles.
     outer = np.sign(np.linalg.det(flat[:, 1:] - flat[:, :1]).sum())
-    area = np.linalg.det(points[triangles][:, 1:] - points[triangles][:, :1])
     triangles[area * outer < 0] = triangles[area * outer < 0][:, ::-1]
     count, here = len(ring), np.arange(len(ring))
     x, y = ring.T

@@ -119,7 +119,8 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         exact = np.concatenate([side.evenly(_CURVED) for side in panel.edges])
         tables.append(points - exact.min(axis=0) + [at, 0.0])  # in one place, whatever the edge length
         at += float(np.ptp(exact[:, 0])) + _MARGIN
-        laid = folded(points, panel.folds, np.sign(_signed_area(exact)))
+        across = all(place is not None for places in ends[panel.name] for place in places)
+        laid = folded(points, panel.folds if across else (), np.sign(_signed_area(exact)))
         placed.append(laid @ panel.rotation.T + panel.translation)
         faces.append(triangles + start)
         owner.append(np.full(len(triangles), number))

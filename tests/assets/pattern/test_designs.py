@@ -20,8 +20,8 @@ from hood.mesh import topology
 OPENINGS = {
     **dict.fromkeys(("tank", "tshirt", "shirt", "blouse", "bomber", "gilet", "blazer"), 4),
     **dict.fromkeys(("bodice", "sheath", "dress", "swing", "shift"), 4),
-    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "poncho", "cape"), 2),
-    **dict.fromkeys(("trousers", "leggings", "shorts", "jeans"), 3),
+    **dict.fromkeys(("skirt", "pencil", "circle", "gathered", "tiered", "pleated", "wrap", "poncho", "cape"), 2),
+    **dict.fromkeys(("trousers", "leggings", "shorts", "jeans", "apron"), 3),
     "hoodie": 4,
     "jumpsuit": 5,
 }
@@ -81,7 +81,7 @@ def test_panels_weld_to_an_oriented_sheet(name: str, bodies: list[Measures]) -> 
         sheet = sheet_of(pattern, 0.035, name)
         half = sheet.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         assert len(np.unique(half, axis=0)) == len(half)  # every edge is passed once each way
-        assert len(topology.boundary_loops(sheet.faces)) == OPENINGS[name]
+        assert len(topology.boundary_loops(sheet.faces)) == OPENINGS[name] + (options.get("straps") == "back")
         assert len(np.unique(topology.connected_components(len(sheet.pos), topology.unique_edges(sheet.faces)))) == 1
         normal = np.cross(*(sheet.pos[sheet.faces[:, k]] - sheet.pos[sheet.faces[:, 0]] for k in (1, 2)))
         forward = [mask for key, mask in sheet.panels.items() if "front" in key and "sleeve" not in key]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hood.media.renderer.render import FAR, hem_distance, sewn
+from hood.media.renderer.raster import Camera
+from hood.media.renderer.render import FAR, RenderMesh, hem_distance, render_frame, sewn
 from hood.testing import cylinder, sphere
 
 
@@ -37,3 +38,23 @@ def test_an_edge_and_a_seam_are_drawn_and_fade_where_pixels_are_large() -> None:
     far = sewn(dist, np.full(5, 0.03))
     assert near[2] < far[2] < 1.0
     assert far[4] == 1.0
+
+
+def test_lines_of_a_patch_are_its_own() -> None:
+    pos, faces = (np.asarray(values) for values in cylinder(40, 30, radius=0.2, height=0.6))
+    patch = pos[faces[0]] * [1.005, 1.0, 1.005]
+    both = hem_distance(np.concatenate([pos, patch]), np.concatenate([faces, [[len(pos), len(pos) + 1, len(pos) + 2]]]))
+    np.testing.assert_array_equal(both[: len(pos)], hem_distance(pos, faces))
+    np.testing.assert_allclose(both[len(pos) :], 0.0, atol=1e-12)
+
+
+def test_cloth_beside_a_sharp_fold_is_drawn_as_without_it() -> None:
+    x, y = (grid.reshape(-1) for grid in np.meshgrid(np.linspace(0.0, 0.4, 9), np.linspace(0.0, 0.2, 5), indexing="ij"))
+    number = np.arange(45).reshape(9, 5)
+    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    folded = np.stack([np.minimum(x, 0.4 - x), y, -0.05 * np.maximum(x - 0.2, 0.0)], axis=1)
+    camera = Camera((0.1, 0.1, 1.0), (0.1, 0.1, 0.0))
+    front = RenderMesh(folded, faces[(x[faces] < 0.21).all(axis=1)])
+    pictures = [render_frame([mesh], camera, 80, 80, floor=-1.0).astype(int) for mesh in (front, RenderMesh(folded, faces))]
+    assert np.abs(pictures[0] - pictures[1]).max() < 25
