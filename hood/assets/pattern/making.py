@@ -260,11 +260,7 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
 
 
 def folded(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
-<<<<<<< HEAD
-    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are folds that do not meet, one way and back; without, flat.
-=======
-    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not cross; without, flat.
->>>>>>> pleats
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, folds that do not cross, one way and back; without, flat.
 
     Args:
         folds: that run across the panel.
