@@ -25,7 +25,7 @@ from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.fronts import opened
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
-from hood.cloth.state import Obstacle, State, StepInput
+from hood.cloth.state import Attachments, Obstacle, State, StepInput
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
@@ -320,7 +320,10 @@ class _Work:
             skin, thin = np.concatenate([skin, points]), np.concatenate([thin, points])
         self.skin, self.thin, self.body_faces = (torch.as_tensor(table) for table in (skin, thin, faces))
         self.closed, fastening = sheet.closed, fastening_of(sheet.rows, torch.as_tensor(self.begun))
-        self.fastened = fastening and replace(fastening.pairs, length=torch.full_like(fastening.pairs.length, ROOM), speed=None)
+        self.fastened: Attachments | None = None
+        if fastening is not None:
+            pairs = fastening.pairs
+            self.fastened = replace(pairs, length=torch.full((len(pairs.edges),), ROOM, dtype=torch.float64), speed=None)
         self.progress = ProgressLines("sewing")
         self._growth = start.growth / max(float((self.skin - self.thin).norm(dim=1).max()), 1e-9)
 

@@ -8,9 +8,9 @@ file, angles in degrees; other programs pass it over:
   counter-clockwise; ``"bending"`` of a fold is a factor on the stiffness there;
 - an edge: ``"hood": {"elastic": 0.85, "bending": 3, "width": 2}``, the same of the cloth within a width of it, such as a hem;
 - a side of a stitch: ``{"panel": "cuff", "edge": 0, "hood": {"angle": 150, "bending": 4}}``, the angle of a seam as its first
-  panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons so far
-  from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches 3 below
-  the first.
+  panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons
+  so far from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches
+  3 below the first.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class EdgeMaking:
 
 @dataclass(frozen=True)
 class Fastener:
-    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres; of 0 a zip,
-    all of them. The second one reaches ``overlap`` [m] below the first."""
+    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres; of 0 a
+    zip, all of them. The second one reaches ``overlap`` [m] below the first."""
 
     row: str
     every: float = 0.0

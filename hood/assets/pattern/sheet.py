@@ -259,8 +259,7 @@ def _divisions(
 
 
 def _apart(shares: set[float], least: float) -> np.ndarray:
-    """Shares of a side in their order; those nearer to each other than ``least`` are one, as ends of folds on both sides of a
-    stitch are."""
+    """Shares of a side in their order, as one where they are nearer than ``least``: ends of folds on both sides of a stitch."""
     steps = np.unique(np.round(sorted(shares), 9))
     group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
     middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]

@@ -93,7 +93,9 @@ def test_collars_and_lapels_are_folded_outwards(name: str, measures: Measures) -
 def test_quilting_is_level_and_meets_at_the_sides(measures: Measures) -> None:
     for tube in (0.06, 0.08, 0.15):
         pattern = draft("gilet", measures, {"tube": tube})
-        heights = {key: np.array([fold.start[1] for fold in panel.folds]) for key, panel in pattern.panels.items() if panel.folds}
+        heights = {
+            key: np.array([fold.start[1] for fold in panel.folds]) for key, panel in pattern.panels.items() if panel.folds
+        }
         assert set(heights) == {"back", "left_front", "right_front"}
         np.testing.assert_array_equal(heights["left_front"], heights["right_front"])
         low = min(len(own) for own in heights.values()) - 1
