@@ -248,3 +248,16 @@ def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, n
         weights[rows] = bary[np.arange(len(rows)), face[rows]]
     weights = weights.clip(min=0.0)
     return face, weights / weights.sum(axis=1, keepdims=True)
+
+
+def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
+    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
+    u, v = following.T
+    result = np.zeros(len(points), dtype=bool)
+    for k in range(len(outline)):
+        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
+        if crossed.any():
+            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
+            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
+    return result

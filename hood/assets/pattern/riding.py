@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial import Delaunay, cKDTree
 
-from hood.mesh.flat import in_triangles
+from hood.mesh.flat import in_triangles, inside
 from hood.mesh.geometry import vertex_normals
 from hood.mesh.parts import Riders, join_riders, rigid_anchors
 
@@ -116,8 +116,6 @@ def _rider(
     normals: np.ndarray,
 ) -> Riders:
     """One of them: its upper side between points of the outline and the cloth's own inside, and a rim down to the cloth."""
-    from hood.assets.pattern.sheet import inside
-
     flat, corners = sheet.uv[sheet.uv_faces[own]], sheet.faces[own]
     rows = np.unique(sheet.uv_faces[own])
     start = sheet.uv[rows[sheet.outline[rows] == 0.0][0]]

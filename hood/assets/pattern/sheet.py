@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay, cKDTree
 from hood.assets.pattern.making import Fastener, construction_of, folded
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.mesh import topology
-from hood.mesh.flat import Construction, in_triangles
+from hood.mesh.flat import Construction, in_triangles, inside
 
 #: Points inside a panel keep this share of the edge length from its outline.
 _FROM_OUTLINE = 0.6
@@ -393,19 +393,6 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     count = max(int(np.ceil(4.0 * np.linalg.norm(following - outline, axis=1).max() / edge)), 1)
     share = np.arange(count)[:, None, None] / count
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
-
-
-def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
-    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
-    u, v = following.T
-    result = np.zeros(len(points), dtype=bool)
-    for k in range(len(outline)):
-        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
-        if crossed.any():
-            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
-            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
-    return result
 
 
 def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, names: list[str], where: str) -> None:
