@@ -17,6 +17,8 @@ MODULES = {
     "hood/assets/formats/gltf_animation.py": "one chapter of glTF: nodes in time, and the vertices that follow them",
     "hood/assets/pattern/blocks.py": "the blocks of flat pattern making, which share their table and their outlines",
     "hood/assets/pattern/bottoms.py": "designs of one kind, each a draft of its panels",
+    "hood/assets/pattern/fronts.py": "what opens in front: panels, collars and lapels drawn, then cut open once they are sewn",
+    "hood/assets/pattern/making.py": "one key of a pattern: read, written and put on the sides of its faces",
     "hood/assets/pattern/pattern.py": "one format: read, checked and written, a sentence for whatever in it cannot be sewn",
     "hood/assets/pattern/sheet.py": "one way from a pattern to a mesh: divisions, folds, triangles, welds, windings",
     "hood/assets/motion/animated_mesh.py": "a moving mesh as a body: read or given, its unit, bearing, seams and sides",

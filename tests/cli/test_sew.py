@@ -119,6 +119,23 @@ def test_a_design_is_sewn_and_its_pattern_can_be_sewn_again(tmp_path: Path, caps
     assert areas[1] == pytest.approx(areas[0], rel=1e-6)
 
 
+@pytest.mark.usefixtures("compiled_layers")
+def test_a_zip_closes_a_front_and_is_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "gilet.npz"
+    assert main(["sew", "design:gilet", "design={tube:0.15}", "edge=0.05", "sheet=none", f"output={target}"]) == 0
+    assert "front_zip: " in capsys.readouterr().out
+    garment = load_garment(target)
+    pairs = (garment.fasteners or {})["front_zip"]
+    assert len(pairs) > 8
+    apart = {}
+    for events in ([], [{"frame": 0, "open": "front_zip"}]):
+        *_, last = hood.simulate(garment, "walk_brisk", num_frames=6, events=events)
+        pos = last.world_pos.numpy()
+        apart[len(events)] = np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1)
+    assert apart[0].max() < 7e-3
+    assert apart[1].max() > 1e-2
+
+
 def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sew", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())

@@ -17,10 +17,9 @@ from hood.assets.pattern.blocks import XY, Place, Side, SideKey, Table, both_hal
 from hood.assets.pattern.making import EdgeMaking, Fastener, Fold
 from hood.assets.pattern.measures import Measures
 from hood.assets.pattern.pattern import Edge, Stitch
-from hood.assets.pattern.riding import in_triangles
 from hood.assets.pattern.sheet import PatternSheet
 from hood.mesh import geometry, topology
-from hood.mesh.flat import SIDE_TABLES, Construction
+from hood.mesh.flat import SIDE_TABLES, Construction, in_triangles
 
 #: What an opening may be closed by: rows of fasteners, and what lies below them.
 CLOSED = {"buttons": Fastener("front_buttons", 0.08, 0.03), "zip": Fastener("front_zip", 0.0, 0.02)}
@@ -40,8 +39,8 @@ _CREASED = 30.0
 _GORGE, _TURNED_PARTS = 0.06, ("lapel", "stand", "fall")
 #: The angle of a seam of quilting [rad], and the shortest one [m]; points of a side that tell where it ends.
 _QUILTED, _SHORTEST_LINE, _FINE = math.radians(110.0), 0.05, 512
-#: A fall is by this share longer at its outer edge; it is placed so far [m] outside of its stand, and begins so far [m] from the
-#: middle of the front.
+#: A fall is by this share longer at its outer edge; it is placed so far [m] outside of its stand, and begins so far [m] from
+#: the middle of the front.
 _SPREAD, _OUTSIDE, _FROM_MIDDLE = 0.3, 0.015, 0.012
 
 
@@ -60,8 +59,8 @@ def _divide(t: Table, name: str, fastener: Fastener, placket: EdgeMaking) -> Non
     starts = np.array([edge.start for edge in panel.edges])
     ends = np.flatnonzero(np.abs(starts[:, 0]) < _MIDDLE)
     low, high = ends[np.argsort(starts[ends, 1])]
-    moved: dict[tuple[str, int], tuple[str, int]] = {}
     count = len(keys)
+    moved: dict[tuple[str, int], tuple[str, int]] = {}
     for side, first, last in (("left", low, high), ("right", high, low)):
         own = [(first + k) % count for k in range((last - first) % count)]
         cut = Edge(starts[last], starts[first], np.zeros((0, 2)), making=placket)
@@ -75,8 +74,8 @@ def _divide(t: Table, name: str, fastener: Fastener, placket: EdgeMaking) -> Non
 
 
 def stand(t: Table, m: Measures, height: float, raised: float = 0.0, apart: float = 0.0) -> None:
-    """The stand of a collar, two strips on the neckline that begin ``raised`` [m] above it; its upper edge in front is divided so
-    far [m] from the middle."""
+    """The stand of a collar, two strips on the neckline that begin ``raised`` [m] above it; its upper edge in front is divided
+    so far [m] from the middle."""
     for back in (False, True):
         name = "back" if back else "front"
         below = t.keys(name, "neck")
@@ -176,8 +175,8 @@ def lapels(t: Table, m: Measures, wide: float, fall: float) -> None:
 
 
 def _draw_lapel(t: Table, m: Measures, top: np.ndarray, low: np.ndarray, size: tuple[float, float, float]) -> None:
-    """Lapel, stand and fall on the neckline of the left front from ``top`` to ``low`` (2,), and their mirror images; ``size`` is
-    the width of the lapel, that of the fall, and the height of the stand [m]."""
+    """Lapel, stand and fall on the neckline of the left front from ``top`` to ``low`` (2,), and their mirror images; ``size``
+    is the width of the lapel, that of the fall, and the height of the stand [m]."""
     wide, fall, height = size
     down = (low - top) / np.linalg.norm(low - top)
     out = np.array([-down[1], down[0]])  # away from the middle
@@ -267,8 +266,8 @@ def opened(sheet: PatternSheet, worn: np.ndarray) -> tuple[PatternSheet, np.ndar
         worn: (V, 3) m, where its vertices are.
 
     Returns:
-        That sheet; where its vertices are, one edge lifted off the other; and for each the vertex (of V) that it was, or that is
-        next to it.
+        That sheet; where its vertices are, one edge lifted off the other; and for each the vertex (of V) that it was, or that
+        is next to it.
     """
     _, welds = np.unique(topology.connected_components(len(sheet.uv), sheet.joins), return_inverse=True)
     before = np.zeros(int(welds.max()) + 1, dtype=np.int64)
@@ -302,8 +301,8 @@ def _two(pairs: np.ndarray) -> np.ndarray:
 
 
 def _spaced(pairs: np.ndarray, pos: np.ndarray, every: float) -> np.ndarray:
-    """Those of the pairs (N, 2) of vertices ``pos`` (V, 3) [m] that are fastened, from the top down, ``every`` so many metres; of
-    0 all. The lowest button is half of that above the end or more."""
+    """Those of the pairs (N, 2) of vertices ``pos`` (V, 3) [m] that are fastened, from the top down, ``every`` so many metres;
+    of 0 all. The lowest button is half of that above the end or more."""
     pairs = _two(pairs)
     middle = pos[pairs].mean(axis=1)
     order = np.argsort(-middle[:, 1], kind="stable")
@@ -321,8 +320,8 @@ def _panel_of(sheet: PatternSheet, points: np.ndarray) -> np.ndarray:
 
 
 def _lift(sheet: PatternSheet, welds: np.ndarray, pos: np.ndarray) -> np.ndarray:
-    """(N, 3) m by which vertices at ``pos`` (N, 3) of the sheet cut open, those of ``uv`` as ``welds`` says, are lifted off what
-    will lie below them: those of the first edge, and all near to it on its side."""
+    """(N, 3) m by which vertices at ``pos`` (N, 3) of the sheet cut open, those of ``uv`` as ``welds`` says, are lifted off
+    what will lie below them: those of the first edge, and all near to it on its side."""
     lift, faces = np.zeros_like(pos), welds[sheet.uv_faces]
     edges = topology.unique_edges(faces)
     long = np.linalg.norm(pos[edges[:, 0]] - pos[edges[:, 1]], axis=1)

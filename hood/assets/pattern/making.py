@@ -9,8 +9,8 @@ file, angles in degrees; other programs pass it over:
 - an edge: ``"hood": {"elastic": 0.85, "bending": 3, "width": 2}``, the same of the cloth within a width of it, such as a hem;
 - a side of a stitch: ``{"panel": "cuff", "edge": 0, "hood": {"angle": 150, "bending": 4}}``, the angle of a seam as its first
   panel sees it, and how stiff its layers are; ``{"fastener": "front_buttons", "every": 8, "overlap": 3}`` is a row of buttons
-  so far from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches 3
-  below the first.
+  so far from each other in its place, without ``every`` a zip: sewn with the other seams, then opened; the second side reaches
+  3 below the first.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class EdgeMaking:
 
 @dataclass(frozen=True)
 class Fastener:
-    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres;
-    of 0 a zip, all of them. The second one reaches ``overlap`` [m] below the first."""
+    """What closes two edges in the place of a seam: a row of that name, a pair of vertices ``every`` so many metres; of 0 a
+    zip, all of them. The second one reaches ``overlap`` [m] below the first."""
 
     row: str
     every: float = 0.0
@@ -255,7 +255,7 @@ def with_elastic(sheet: PatternSheet, rim: np.ndarray, factor: float, width: flo
 
 
 def laid(points: np.ndarray, folds: Sequence[Fold], outer: float) -> np.ndarray:
-    """(N, 3) m: points (N, 2) of a panel with its pleats laid, which are two folds or more that do not cross; without, flat.
+    """(N, 3) m: points (N, 2) of a panel with its pleats laid, folds that do not cross, one way and back; without, flat.
 
     Args:
         folds: that run across the panel.
@@ -316,9 +316,11 @@ def band_along(flat: np.ndarray, faces: np.ndarray, line: np.ndarray, width: flo
     between = np.linspace(0.0, 1.0, count)[:, None, None]
     points = ((1.0 - between) * line[:, 0] + between * line[:, 1]).reshape(-1, 2)
     ways = np.broadcast_to(line[:, 1] - line[:, 0], (count, len(line), 2)).reshape(-1, 2)
-    tree = cKDTree(points)
-    distance, nearest = tree.query(flat.mean(axis=1))
-    start, end = np.roll(flat, -1, axis=1), np.roll(flat, -2, axis=1)
+    tree, own = cKDTree(points), flat[faces]
+    distance, nearest = tree.query(own.mean(axis=1))
+    start, end = np.roll(own, -1, axis=1), np.roll(own, -2, axis=1)
     along = np.concatenate([(1.0 - s) * start + s * end for s in np.linspace(0.0, 1.0, _SAMPLES)], axis=1)
-    near = (tree.query(along)[0] <= (1.0 + _ROUND) * width).reshape(len(flat), _SAMPLES, 3).mean(axis=1)
-    return Band(faces & (distance <= width), ways[nearest], np.where(faces[:, None], near, 0.0))
+    near = (tree.query(along)[0] <= (1.0 + _ROUND) * width).reshape(len(own), _SAMPLES, 3).mean(axis=1)
+    inside, way, share = faces.copy(), np.zeros((len(flat), 2)), np.zeros((len(flat), 3))
+    inside[faces], way[faces], share[faces] = distance <= width, ways[nearest], near
+    return Band(inside, way, share)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial import Delaunay, cKDTree
 
+from hood.mesh.flat import in_triangles, inside
 from hood.mesh.geometry import vertex_normals
 from hood.mesh.parts import Riders, join_riders, rigid_anchors
 

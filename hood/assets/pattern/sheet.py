@@ -13,7 +13,7 @@ from hood.assets.pattern.making import Fastener, construction_of, laid
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
 from hood.assets.pattern.riding import in_triangles, inside
 from hood.mesh import topology
-from hood.mesh.flat import Construction
+from hood.mesh.flat import Construction, in_triangles, inside
 
 #: Points inside a panel keep this share of the edge length from its outline.
 _FROM_OUTLINE = 0.6
@@ -125,15 +125,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
         owner.append(np.full(len(triangles), number))
         start += len(points)
     pos, corners, of_panel = np.concatenate(placed), np.concatenate(faces), np.concatenate(owner)
-    pairs, fastened = [_NONE], []
-    for stitch in pattern.stitches:
-        first, second = outlines[stitch.first], outlines[stitch.second]
-        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
-        if stitch.fastener is None:
-            pairs.append(pair)
-        else:
-            fastened.append((stitch.fastener, pair))
-    joins = np.concatenate(pairs)
+    joins, fastened = _joined(pattern, outlines)
     joined = np.concatenate([joins, *(pair for _, pair in fastened)])
     label = topology.connected_components(start, joined)
     _, welds = np.unique(label, return_inverse=True)
@@ -155,7 +147,22 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     sewn = PatternSheet(
         middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
     )
-    return replace(sewn, joins=joins, fastened=tuple(fastened))
+    return replace(sewn, joins=joins, fastened=fastened)
+
+
+def _joined(
+    pattern: Pattern, outlines: Mapping[tuple[str, int], np.ndarray]
+) -> tuple[np.ndarray, tuple[tuple[Fastener, np.ndarray], ...]]:
+    """``joins`` and ``fastened`` of a sheet."""
+    pairs, fastened = [_NONE], []
+    for stitch in pattern.stitches:
+        first, second = outlines[stitch.first], outlines[stitch.second]
+        pair = np.stack([first, second if stitch.same else second[::-1]], axis=1)
+        if stitch.fastener is None:
+            pairs.append(pair)
+        else:
+            fastened.append((stitch.fastener, pair))
+    return np.concatenate(pairs), tuple(fastened)
 
 
 def carry_over(coarse: PatternSheet, pos: np.ndarray, fine: PatternSheet) -> np.ndarray:
@@ -258,8 +265,7 @@ def _divisions(
 
 
 def _apart(shares: set[float], least: float) -> np.ndarray:
-    """Shares of a side in their order; those nearer to each other than ``least`` are one, as ends of folds on both sides of a
-    stitch are."""
+    """Shares of a side in their order, as one where they are nearer than ``least``: ends of folds on both sides of a stitch."""
     steps = np.unique(np.round(sorted(shares), 9))
     group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
     middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]

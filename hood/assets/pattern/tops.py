@@ -130,14 +130,14 @@ def _bomber(t: Table, m: Measures, o: Options) -> None:
     for back in (False, True):
         name = "back" if back else "front"
         cut = [length / 1.1 for length in t.lengths(t.keys(name, "hem"))]
-        draw_strip(t, f"band_{name}", cut, cut, o.band, hem - o.band, trunk_place(m, back))
-        t.sew_all(t.keys(name, "hem"), t.keys(f"band_{name}", "above"))
-    t.sew_keys("band_front", "band_back", ["side"])
+        draw_strip(t, f"ribbing_{name}", cut, cut, o.band, hem - o.band, trunk_place(m, back))
+        t.sew_all(t.keys(name, "hem"), t.keys(f"ribbing_{name}", "above"))
+    t.sew_keys("ribbing_front", "ribbing_back", ["side"])
     around = np.interp(hem - 0.5 * o.band, [m.hip_height, m.waist_height], [m.hips, m.waist])
-    ribbed(t, o.rib * around / (4.0 * cut[0]), "band_front", "band_back")
+    ribbed(t, o.rib * around / (4.0 * cut[0]), "ribbing_front", "ribbing_back")
     ribbed(t, 0.82 * o.rib, *(f"{side}_cuff_{name}" for side in ("left", "right") for name in ("front", "back")))
     ribbed(t, 0.9, "collar_front", "collar_back")
-    open_front(t, o.front, "collar_front", "front", "band_front")
+    open_front(t, o.front, "collar_front", "front", "ribbing_front")
 
 
 @entered(

@@ -282,6 +282,21 @@ def test_what_cannot_be_made_is_told(tmp_path: Path, hood: dict[str, Any], messa
         _sheet(tmp_path, _made(**hood))
 
 
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"every": 8}, r"hood.every is 8 without a fastener; name its row"),
+        ({"fastener": "front zip"}, r"hood.fastener is 'front zip'; give the name of a row"),
+        ({"fastener": "zip", "overlap": 0.2}, r"hood.overlap is 0.2; give a number from 0.5 to 100"),
+    ],
+)
+def test_a_fastener_that_cannot_be_is_told(tmp_path: Path, own: dict[str, Any], message: str) -> None:
+    content = skirt()
+    content["pattern"]["stitches"][0][0]["hood"] = own
+    with pytest.raises(ValueError, match=f"stitch 0: {message}"):
+        _sheet(tmp_path, content)
+
+
 def test_how_a_pattern_is_made_is_written(tmp_path: Path) -> None:
     content = skirt()
     own = content["pattern"]["panels"]["front"]
