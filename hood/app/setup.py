@@ -15,7 +15,7 @@ from hood.app.output.frames import check_output_fps, check_refine_mesh
 from hood.app.output.verdict import FAIL_ON
 from hood.app.plan_file import plan_path, read_watch
 from hood.app.scene.events import checked_events, with_events
-from hood.app.scene.fabrics import checked_fabrics, fabric_of, with_grain
+from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
 from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
@@ -112,9 +112,6 @@ def set_up(
     """
     config, why = decided(config)
     scene = make_scene(config, own)
-    if own.material is None:
-        config, weave = with_grain(config, scene.garment)
-        why = [*why, *weave]
     choice = choose(config, stepper, scene)
     choice.why[:0] = why
     settled = choice.settle(config)

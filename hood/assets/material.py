@@ -199,7 +199,7 @@ def measured(
     bending_warp: float,
     bending_weft: float,
     friction: float = 1.0,
-    woven: bool | str = False,
+    woven: bool = False,
 ) -> Material:
     """The fabric nearest to a measured cloth, by the rules above.
 
@@ -209,8 +209,7 @@ def measured(
         shear: force per width over the angle of shear in radians, N/m.
         bending_warp, bending_weft: bending rigidity of a strip along warp or weft per width, N·m.
         friction: times the coefficient of friction on the body.
-        woven: whether it stretches along warp and weft as measured; otherwise it is isotropic. ``"auto"`` is isotropic here:
-            ``hood rollout`` settles it for a garment (:func:`hood.app.scene.fabrics.with_grain`).
+        woven: whether it stretches along warp and weft as measured; otherwise it is isotropic.
 
     Raises:
         ValueError: a value is not finite, or not positive (bending may be 0), or ``woven`` is neither true nor false; names
@@ -229,9 +228,8 @@ def measured(
         bending = key.startswith("bending")
         if not math.isfinite(value) or value < 0 or (value == 0 and not bending):
             raise ValueError(f"material {key!r} is {value}; it must be finite and {'>= 0' if bending else '> 0'}")
-    if not isinstance(woven, bool) and woven != "auto":
-        raise ValueError(f"material 'woven' is {woven!r}; give true (warp and weft as measured), false (isotropic) or auto")
-    woven = woven is True
+    if not isinstance(woven, bool):
+        raise ValueError(f"material 'woven' is {woven!r}; give true (warp and weft as measured) or false (isotropic)")
     poisson = min(max(0.5 * math.sqrt(stretch_warp * stretch_weft) / shear - 1.0, 0.0), _POISSON)
     mu = shear / _THICKNESS
     lam = 2.0 * mu * poisson / (1.0 - poisson)

@@ -9,35 +9,31 @@ from typing import Any
 
 import numpy as np
 import yaml
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, options, plain
-from hood.app.settings.rollout_settings import RolloutSettings, Settings
+from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import part_faces
-from hood.assets.material import Material, bending_length, measured
+from hood.assets.material import Material, measured
 from hood.cloth.fabric import patchwork
 from hood.plugins import config_folders
 from hood.scene.body_motion.motion import BodyMotion, Motion
 
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
 AUTO = "auto"
-#: Bending length [m] up to which cloth drapes too stiffly with threads: triangles cannot curve across them
-#: (hood/studies/notes/fabrics.md).
-_LIMP = 0.016
 
 
-def fabric_of(config: RolloutSettings, garment: Garment, motion: Motion) -> Material:
+def fabric_of(config: Settings, garment: Garment, motion: Motion) -> Material:
     """The fabric that the config gives to ``garment``.
 
     Raises:
         ConfigError: ``fabrics`` is no table of parts and fabrics, or names a fabric that there is not.
         ValueError: it names a part that the garment does not have.
     """
-    settled, _ = with_grain(config, garment)
-    material: Material = build(settled.material)
-    parts, width = checked_fabrics(settled, solved(config) and garment.flat is not None), checked_seams(config)
+    material: Material = build(config.material)
+    parts, width = checked_fabrics(config), checked_seams(config)
     if not parts:
         return material
     body = motion.body if isinstance(motion, BodyMotion) else None
@@ -76,38 +72,14 @@ def _values(name: str) -> dict[str, Any]:
     return dict(yaml.safe_load(next(file for file in files if file.exists()).read_text(encoding="utf-8")))
 
 
-def with_grain(config: RolloutSettings, garment: Garment) -> tuple[RolloutSettings, list[str]]:
-    """The config with ``material.woven=auto`` settled for a garment, and a sentence where warp and weft are chosen.
-
-    They are where a solver takes the steps, the garment has the flat pattern that tells their direction, and the cloth is stiff
-    enough that triangles may have them and drape as it does (:data:`_LIMP`). Networks know no warp.
-    """
-    if config.material.get("woven") != AUTO:
-        return config, []
-    woven = solved(config) and garment.flat is not None and _may_weave(config.material)
-    why = "material.woven=true: warp and weft run as in the garment's flat pattern; material.woven=false leaves them out"
-    material = OmegaConf.create({**plain(config.material), "woven": woven})
-    return config.with_values(material=material), [why] if woven else []
-
-
 def solved(config: Settings) -> bool:
     """Whether a solver takes a rollout's steps, or may (``stepper=auto``); not in training and evaluation."""
     stepper, stepping = config.get("stepper"), plain(config.get("stepping"))
     return stepper == AUTO or (stepper is not None and isinstance(stepping, dict) and not stepping.get("network", False))
 
 
-def _may_weave(cloth: Mapping[str, Any]) -> bool:
-    if max(float(cloth["stretch_warp"]), float(cloth["stretch_weft"])) <= 3.0 * float(cloth["shear"]):
-        return False  # leather and felt have no threads: the isotropic sheet stretches as they do
-    rigidity = 0.5 * (float(cloth["bending_warp"]) + float(cloth["bending_weft"]))
-    return bending_length(rigidity, float(cloth["density"])) > _LIMP
-
-
-def checked_fabrics(config: Settings, grain: bool = False) -> dict[str, Material]:
+def checked_fabrics(config: Settings) -> dict[str, Material]:
     """``fabrics`` of a config: fabrics by part.
-
-    Args:
-        grain: whether warp and weft have a direction, so that ``woven=auto`` may choose them.
 
     Raises:
         ConfigError: it is something else, or a fabric or a property is unknown.
@@ -120,7 +92,7 @@ def checked_fabrics(config: Settings, grain: bool = False) -> dict[str, Material
         raise ConfigError(
             f"fabrics={value}: give fabrics by part, such as fabrics={{below_waistband:silk,above_waistband:denim}}"
         )
-    return {str(part): _fabric(str(part), fabric, config, grain) for part, fabric in value.items()}
+    return {str(part): _fabric(str(part), fabric, config) for part, fabric in value.items()}
 
 
 def checked_seams(config: Settings) -> float:
@@ -139,7 +111,7 @@ def checked_seams(config: Settings) -> float:
     return float(width)
 
 
-def _fabric(part: str, given: str | dict[str, Any], config: Settings, grain: bool) -> Material:
+def _fabric(part: str, given: str | dict[str, Any], config: Settings) -> Material:
     """The fabric of a part: an option of ``material=``, or a table of one and of properties instead of its own."""
     own = {} if isinstance(given, str) else {str(key): value for key, value in given.items()}
     name = given if isinstance(given, str) else own.pop("material", None)
@@ -154,8 +126,6 @@ def _fabric(part: str, given: str | dict[str, Any], config: Settings, grain: boo
             raise ConfigError(f"fabrics: {part}: {key} is {value!r}; give a number")
     if woven is not None and (name is None or not is_measured(name)):
         raise ConfigError(f"fabrics: {part}: woven is for measured cloth by its name (material: linen); give warp and weft")
-    if name is not None and woven in (None, AUTO) and is_measured(name):
-        woven = grain and _may_weave(_values(name))
     base: Material = build(config.material) if name is None else fabric_named(name, woven)
     return replace(base, **own)
 

@@ -33,7 +33,7 @@ TABLES = tuple("size size_end fabrics refine metrics cloth_contact objects train
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself; and those that are "auto", or a value of another kind that their reader checks.
-_FOLDER, _OPEN = "output", ("wind", "velocity", "woven")
+_FOLDER, _OPEN = "output", ("wind", "velocity")
 #: Of a key that is not there.
 _ABSENT = object()
 #: What a value must be, by the type of the default that it replaces.

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 
-from hood.app.scene.fabrics import checked_fabrics, fabric_named, with_grain
-from hood.app.scene.motion import Own
+from hood.app.scene.fabrics import checked_fabrics, fabric_named
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene
-from hood.assets.garment.garment import load_garment
 from hood.assets.material import FaceField
-from hood.mesh.flat import laid_out
 
 
 def test_parts_of_a_dress_have_their_fabrics_in_the_scene() -> None:
@@ -123,34 +117,3 @@ def test_keys_of_the_material_make_it_woven() -> None:
     assert make_scene(RolloutSettings.from_words(["garment=tank", "material=linen", "num_frames=3"])).cloth.weave is None
     with pytest.raises(ValueError, match="material 'warp' is 0.0; it must be finite and > 0"):
         make_scene(RolloutSettings.from_words(["garment=tank", "material.warp=0", "num_frames=3"]))
-
-
-@pytest.mark.parametrize(
-    ("words", "woven", "why"),
-    [
-        ("material=linen", True, True),
-        ("material=linen stepper=newton", True, True),
-        ("material=linen material.woven=false", False, False),
-        ("material=silk_habotai material.woven=true", True, False),
-        ("material=linen stepper=network", False, False),  # which knows no warp
-        ("material=silk_habotai", False, False),  # limp: triangles would hold it out
-        ("material=nappa_leather", False, False),  # no threads
-        ("material=denim", False, False),  # not measured
-        ("fabrics={below_waistband:linen}", True, False),
-        ("fabrics={below_waistband:{material:linen,woven:false}}", False, False),
-        ("fabrics={below_waistband:silk_habotai}", False, False),
-    ],
-)
-def test_warp_and_weft_are_those_of_the_flat_pattern(words: str, woven: bool, why: bool) -> None:
-    garment = load_garment("dress")
-    corners = laid_out(torch.as_tensor(garment.rest_pos), torch.as_tensor(garment.faces)).numpy()
-    sewn = replace(garment, flat=np.concatenate([np.zeros_like(corners[:, :1]), corners], axis=1))
-    config = RolloutSettings.from_words(words.split())
-    own = Own(garment=sewn)
-    assert (make_scene(config, own).cloth.weave is not None) == woven
-    settled, told = with_grain(config, sewn)
-    assert bool(told) == why
-    if "woven" in config.material:
-        assert settled.material.woven is (woven and "fabrics" not in words)
-    given = "woven=true" in words
-    assert (make_scene(config, Own(garment=garment)).cloth.weave is not None) == given  # without a pattern only if asked for
