@@ -1,6 +1,6 @@
 """What fabrics do to the parts of a garment: strain and bending, part by part, of rollouts of one garment and motion.
 
-    hood rollout garment=dress sequence=walk_brisk num_frames=45 stepper=newton material=silk_habotai output=outputs/silk
+    hood rollout garment=dress sequence=walk_brisk num_frames=45 material=silk_habotai wind=null output=outputs/silk
     python benchmarks/fabrics.py outputs/silk outputs/denim outputs/two --garment dress --parts below_waistband above_waistband
 
 Printed for each part, over all frames but the first ten: the 99th percentile of the stretch of edges; by how many degrees the

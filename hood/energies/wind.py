@@ -131,27 +131,28 @@ class Wind(Energy):
         return Drag(*self.rows(problem))
 
 
-def air(velocity: float | Sequence[float] | None = None, **settings: Any) -> Wind | None:
+def air(velocity: float | str | Sequence[float] | None = None, **settings: Any) -> Wind | None:
     """The term of a config; None, which a potential leaves out, where there is no air.
 
     Args:
-        velocity: [m/s] (3,), or a number: towards -z, against the front of a body that looks along z; None for no air.
+        velocity: [m/s] (3,), or a number: towards -z, against the front of a body that looks along z; None for no air, as
+            ``"auto"`` is here, which ``hood rollout`` settles (:func:`hood.app.stepping.steppers.air_of`).
         settings: of :class:`Wind`.
 
     Raises:
         ValueError: a value that is not finite or out of range, or gusts without a wind.
     """
     gusts = settings.get("gusts", 0.0)
-    if velocity is None:
+    if velocity is None or velocity == "auto":
         if gusts:
             raise ValueError(
                 f"wind: gusts is {gusts}, but there is no wind that they could be a share of; give wind=3, or "
                 "losses.terms.air.gusts=0"
             )
         return None
-    if isinstance(velocity, (int, float)):
+    if isinstance(velocity, (int, float)) and not isinstance(velocity, bool):
         velocity = (0.0, 0.0, 0.0 - float(velocity))
-    if isinstance(velocity, str) or not all(isinstance(value, (int, float)) for value in velocity):
+    if isinstance(velocity, (bool, str)) or not all(isinstance(value, (int, float)) for value in velocity):
         raise ValueError(f"wind={velocity}: give m/s, a number (wind=3) or three (wind=[3,0,0])")
     return Wind(velocity, **settings)
 

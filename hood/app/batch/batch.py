@@ -31,7 +31,7 @@ from hood.app.settings.record import read_settings
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene, make_stepper
 from hood.app.stepping.automatic import AUTO, choose, decided
-from hood.app.stepping.steppers import GROUP, with_stepper
+from hood.app.stepping.steppers import GROUP, with_air, with_stepper
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import locate, names
 from hood.assets.motion.motion_files import LISTS, find_motions
@@ -384,7 +384,9 @@ def _other_settings(config: Any, attributes: dict[str, Any]) -> dict[str, Any]:
         before = read_settings(attributes["asked"])
     except ValueError:
         return {"asked": None}
-    now = plain(config)
+    now = plain(with_air(config)[0])
+    if before.get("wind") == AUTO:
+        before |= {key: value for key, value in read_settings(attributes["config"]).items() if key in ("wind", "losses")}
     before["plan"] = before.get("plan") or now["plan"]
     before.setdefault("stepping", now["stepping"])  # rollouts from before there were options are known by their word
     if before.get("stepper") == AUTO != now["stepper"]:  # what it became

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from omegaconf import DictConfig
 
 from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, options, plain
 from hood.app.settings.rollout_settings import Settings
@@ -21,6 +22,7 @@ from hood.plugins import config_folders
 from hood.scene.body_motion.motion import BodyMotion, Motion
 
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
+AUTO = "auto"
 
 
 def fabric_of(config: Settings, garment: Garment, motion: Motion) -> Material:
@@ -68,6 +70,12 @@ def _values(name: str) -> dict[str, Any]:
     """What the file of an option of ``material=`` says."""
     files = [folder / "material" / f"{name}.yaml" for folder in (CONFIG_FOLDER, *config_folders())]
     return dict(yaml.safe_load(next(file for file in files if file.exists()).read_text(encoding="utf-8")))
+
+
+def solved(config: Settings) -> bool:
+    """Whether a solver takes a rollout's steps, or may (``stepper=auto``); not in training and evaluation."""
+    stepper, stepping = config.get("stepper"), plain(config.get("stepping"))
+    return stepper == AUTO or (stepper is not None and isinstance(stepping, dict) and not stepping.get("network", False))
 
 
 def checked_fabrics(config: Settings) -> dict[str, Material]:
@@ -132,4 +140,17 @@ def fabric_named(name: str, woven: Any = None) -> Material:
 
 def is_measured(name: str) -> bool:
     """Whether an option of ``material=`` tells measured cloth."""
-    return str(load_config("rollout", [f"material={name}"]).material.get("_target_")) == _MEASURED
+    return _tells_measured(load_config("rollout", [f"material={name}"]).material)
+
+
+def measured_in(config: Settings) -> list[str]:
+    """Measured cloth among the fabrics of a config, by name, none twice."""
+    table = plain(config.fabrics)
+    given = table.values() if isinstance(table, dict) else ()
+    parts = [fabric.get("material") if isinstance(fabric, dict) else str(fabric) for fabric in given]
+    names = [most_alike(plain(config.material)) or "the fabric"] if _tells_measured(config.material) else []
+    return list(dict.fromkeys(names + [name for name in parts if name is not None and is_measured(name)]))
+
+
+def _tells_measured(node: DictConfig) -> bool:
+    return str(node.get("_target_")) == _MEASURED

@@ -32,8 +32,8 @@ _ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 TABLES = tuple("size size_end fabrics refine metrics cloth_contact objects trainer.optimizer trainer.schedule".split())
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
-#: A key that its command checks itself.
-_FOLDER = "output"
+#: A key that its command checks itself; and those that are "auto", or a value of another kind that their reader checks.
+_FOLDER, _OPEN = "output", ("wind", "velocity")
 #: Of a key that is not there.
 _ABSENT = object()
 #: What a value must be, by the type of the default that it replaces.
@@ -297,7 +297,7 @@ def _takes_several(key: str, defaults: DictConfig) -> bool:
         value = OmegaConf.select(defaults, key)
     except OmegaConfBaseException:
         value = None
-    return key != _FOLDER and (value is None or key in _ONE_OR_MORE or isinstance(value, ListConfig))
+    return key != _FOLDER and (value is None or key in (*_ONE_OR_MORE, *_OPEN) or isinstance(value, ListConfig))
 
 
 def _decode_keys(config: DictConfig, chosen: Sequence[Override]) -> None:
@@ -365,7 +365,7 @@ def _check_types(name: str, known: DictConfig, config: DictConfig, prefix: str) 
             continue
         elif f"{prefix}{key}" in TABLES and (isinstance(after, DictConfig) or (key == "optimizer" and isinstance(after, str))):
             continue
-        elif after is None and (prefix == _OPTIONAL or key == _FOLDER):
+        elif key in _OPEN or (after is None and (prefix == _OPTIONAL or key == _FOLDER)):
             continue
         elif before is not None and not _same_kind(before, after):
             raise ConfigError(_wrong_kind(name, f"{prefix}{key}", before, after))

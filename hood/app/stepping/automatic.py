@@ -15,7 +15,7 @@ from hood.app.settings.compose import plain
 from hood.app.settings.rollout_settings import RolloutSettings, refinement, with_value
 from hood.app.stepping.cloth_contact import potential_of
 from hood.app.stepping.refinement import AUTO, refined
-from hood.app.stepping.steppers import losses_of, make_solver, option_of, with_stepper
+from hood.app.stepping.steppers import losses_of, make_solver, option_of, with_air, with_stepper
 from hood.energies.potential import Potential, default_potential
 from hood.rollouts.loop import simulate
 from hood.scene.scene import NotWornError, Scene
@@ -57,11 +57,12 @@ class Choice:
 
 
 def decided(config: RolloutSettings) -> tuple[RolloutSettings, list[str]]:
-    """The config with the stepper that needs no measurement, and why; itself where ``auto`` has to measure, or is not asked."""
+    """The config with the air and the stepper that need no measurement, and why; what has to be measured stays ``auto``."""
+    config, air = with_air(config)
     if str(config.stepper) != AUTO or str(config.device) != "cpu":
-        return config, []
+        return config, air
     why = "stepper=newton: the solver, the default on a CPU; checkpoint=… or refine=… takes a network"
-    return with_stepper(config, "newton"), [why]
+    return with_stepper(config, "newton"), [why, *air]
 
 
 def choose(config: RolloutSettings, stepper: Stepper, scene: Scene) -> Choice:

@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 
 from hood.app.common import UNTRAINED, load_stepper, require_same_model, use_arithmetic, weigh
+from hood.app.scene.fabrics import AUTO, measured_in, solved
 from hood.app.settings.compose import ConfigError, build, load_config, options, plain
 from hood.app.settings.rollout_settings import RolloutSettings, Settings
 from hood.assets.files.library import locate
@@ -40,16 +42,46 @@ def losses_of(config: Settings) -> Potential:
     Raises:
         ConfigError, ValueError: as for :func:`hood.app.settings.compose.build`.
     """
-    content = plain(config.losses)
+    content = _with_air(config)
     if not _own(content):
-        potential: Potential = build(config.losses)
+        potential: Potential = build(content)
         return potential
     text = json.dumps(content)
     if text not in _KNOWN:
-        _KNOWN[text] = build(config.losses)
+        _KNOWN[text] = build(content)
         if len(_KNOWN) > _REMEMBERED:
             del _KNOWN[next(iter(_KNOWN))]
     return Potential(_KNOWN[text].terms)
+
+
+def air_of(config: Settings) -> Any:
+    """``wind`` with ``auto`` settled: still air (0.0) where a solver takes the steps of measured cloth, else no air (None).
+
+    Networks were trained without air, and so was the paper's fabric simulated. Measured cloth is so light, or so limp, that air
+    which is left out shows.
+    """
+    if config.get("wind") != AUTO:
+        return config.get("wind")
+    return 0.0 if config.losses.terms.get("air") is not None and solved(config) and measured_in(config) else None
+
+
+def with_air(config: RolloutSettings) -> tuple[RolloutSettings, list[str]]:
+    """The config with the air of :func:`air_of`, and a sentence where ``auto`` chose some."""
+    if config.wind != AUTO:
+        return config, []
+    wind, names = air_of(config), measured_in(config)
+    sentence = f"wind=0: still air brakes {' and '.join(names)}, as measured cloth; wind=null leaves it out"
+    why = [] if wind is None else [sentence]
+    return config.with_values(losses=OmegaConf.create(_with_air(config)), wind=wind), why
+
+
+def _with_air(config: Settings) -> Any:
+    """The content of ``config.losses``, ``auto`` settled."""
+    content = plain(config.losses)
+    term = content["terms"].get("air") if isinstance(content, dict) and isinstance(content.get("terms"), dict) else None
+    if term is not None and term.get("velocity") == AUTO:
+        term["velocity"] = air_of(config)
+    return content
 
 
 def _own(content: Any) -> bool:

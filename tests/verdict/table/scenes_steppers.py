@@ -52,13 +52,16 @@ STEPPERS = [
 ]
 
 FABRICS = [
-    Scene("dress_silk", "soft fabric", "newton", "dress", "walk_brisk", 30, ("start=1", "material=silk_habotai")),
-    Scene("skirt_chiffon", "soft fabric", "newton", "skirt", "twists", 30, ("start=1", "material=chiffon")),
+    Scene("dress_silk", "soft fabric", "newton", "dress", "walk_brisk", 30, ("start=1", "material=silk_habotai", "wind=null")),
+    Scene("skirt_chiffon", "soft fabric", "newton", "skirt", "twists", 30, ("start=1", "material=chiffon", "wind=null")),
     Scene("tshirt_jersey_network", "soft fabric", "quickstart+5", "tshirt", "bends", 24, ("start=1", "material=jersey")),
-    Scene("trousers_denim", "stiff fabric", "newton", "trousers", "squats", 24, ("start=1", "material=denim_12oz")),
-    Scene("skirt_leather", "stiff fabric", "newton", "skirt", "walk_brisk", 24, ("start=1", "material=nappa_leather")),
-    Scene("shorts_felt", "stiff fabric", "newton", "shorts", "kicks", 24, ("start=1", "material=wool_felt")),
-    Scene("dress_canvas_refined", "stiff fabric", "guess+5", "dress", "dance_slow", 24, ("start=1", "material=cotton_canvas")),
+    Scene("trousers_denim", "stiff fabric", "newton", "trousers", "squats", 24,
+          ("start=1", "material=denim_12oz", "wind=null")),
+    Scene("skirt_leather", "stiff fabric", "newton", "skirt", "walk_brisk", 24,
+          ("start=1", "material=nappa_leather", "wind=null")),
+    Scene("shorts_felt", "stiff fabric", "newton", "shorts", "kicks", 24, ("start=1", "material=wool_felt", "wind=null")),
+    Scene("dress_canvas_refined", "stiff fabric", "guess+5", "dress", "dance_slow", 24,
+          ("start=1", "material=cotton_canvas", "wind=null")),
     Scene("dress_two_fabrics", "several fabrics", "newton", "dress", "walk_brisk", 24,
           ("start=1", "fabrics={below_waistband:silk}", "material=denim")),
     Scene("dress_like_gum", "over-stretched", "newton", "dress", "jumps", 30,
