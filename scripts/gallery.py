@@ -30,7 +30,6 @@ WORN = (
     ("leggings", "cotton_jersey"),
     ("jumpsuit", "cotton_canvas"),
     ("swing", "silk_crepe"),
-    ("sheath", "wool_suiting"),
     ("wrap", "jersey"),
     ("tiered", "chiffon"),
     ("circle", "silk_habotai"),

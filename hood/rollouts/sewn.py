@@ -129,7 +129,7 @@ def judged(
     closed: np.ndarray | None = None,
 ) -> SewnFigures:
     """:class:`SewnFigures` of cloth, cut as ``cut`` (F, 3, 2) [m], at ``pos`` (V, 3) [m], that began at ``begun`` (V, 3) [m]
-    on the body ``before``, or on the same; ``held`` (V,) bool. Openings are those of the faces ``closed`` (G, 3), if not of all."""
+    on the body ``before``, or on the same; ``held`` (V,) bool. Openings are those of ``closed`` (G, 3), else of all faces."""
     if not np.isfinite(pos).all():
         return SewnFigures(0, 0, math.inf, 0, 0, math.inf, math.inf)
     assert cloth.flat is not None

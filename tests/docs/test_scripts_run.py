@@ -114,7 +114,7 @@ RUN = (
 NOT_RUN = {
     r"build_assets\.py": "writes the data of the package anew, with packages from PyPI; tests/tools/assets tests that",
     r"folds\.py": "sews garments and simulates them for minutes each",
-    r"gallery\.py": "21 rollouts of 60 frames at 4,000 vertices",
+    r"gallery\.py": "17 rollouts of 60 frames at 4,000 vertices",
     r"gpu(_checks)?\.py": "needs a CUDA device",
     r"heads\.py (controls|models)": "reads networks that benchmarks/recipes.py trains in hours",
     r"learn_motion\.py": "simulates and trains for a minute; tests/scripts runs it in small",

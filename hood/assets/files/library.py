@@ -77,7 +77,7 @@ def names(kind: str) -> list[str]:
     Examples:
         >>> import hood
         >>> hood.names("garments")[:3]
-        ['dress', 'dress_12k', 'dress_4k']
+        ['apron', 'apron_12k', 'apron_4k']
     """
     if kind not in _SUFFIX:
         raise ValueError(unknown("kind", kind, _SUFFIX))

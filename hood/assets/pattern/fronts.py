@@ -22,7 +22,7 @@ from hood.mesh import geometry, topology
 from hood.mesh.flat import SIDE_TABLES, Construction, in_triangles
 
 #: What an opening may be closed by: rows of fasteners, and what lies below them.
-CLOSED = {"buttons": Fastener("front_buttons", 0.08, 0.03), "zip": Fastener("front_zip", 0.0, 0.02)}
+CLOSURES = {"buttons": Fastener("front_buttons", 0.08, 0.03), "zip": Fastener("front_zip", 0.0, 0.02)}
 #: The edges of an opening are so stiff: a placket of three layers, and the tape of a zip.
 _PLACKETS = {"buttons": EdgeMaking(bending=8.0, width=0.03), "zip": EdgeMaking(bending=4.0, width=0.012)}
 #: Points within this [m] of the middle are on it.
@@ -49,7 +49,7 @@ def open_front(t: Table, front: str, *names: str, every: float | None = None) ->
     ``every`` so many metres."""
     if front == "closed":
         return
-    fastener = CLOSED[front] if every is None else replace(CLOSED[front], every=every)
+    fastener = CLOSURES[front] if every is None else replace(CLOSURES[front], every=every)
     for name in names:
         _divide(t, name, fastener, _PLACKETS[front])
 

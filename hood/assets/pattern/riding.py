@@ -156,29 +156,3 @@ def _divided(outline: np.ndarray) -> np.ndarray:
         count = max(int(np.ceil(np.linalg.norm(end - start) / _STEP)), 1)
         pieces.append(start + np.arange(count)[:, None] / count * (end - start))
     return np.concatenate(pieces)
-
-
-def in_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle (N,) of ``corners`` (F, 3, 2) that each of ``points`` (N, 2) lies in, or is beside, and weights (N, 3)."""
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    face, weights = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
-    for rows in np.array_split(np.arange(len(points)), len(points) * len(corners) // _AT_ONCE + 1):
-        share = np.einsum("fij,nfj->nfi", inverse, points[rows][:, None] - corners[:, 0])
-        bary = np.concatenate([1.0 - share.sum(axis=2, keepdims=True), share], axis=2)
-        face[rows] = bary.min(axis=2).argmax(axis=1)
-        weights[rows] = bary[np.arange(len(rows)), face[rows]]
-    weights = weights.clip(min=0.0)
-    return face, weights / weights.sum(axis=1, keepdims=True)
-
-
-def inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 2) inside a closed outline, by the number of its edges to their right."""
-    (x, y), following = outline.T, np.roll(outline, -1, axis=0)
-    u, v = following.T
-    result = np.zeros(len(points), dtype=bool)
-    for k in range(len(outline)):
-        crossed = (y[k] > points[:, 1]) != (v[k] > points[:, 1])
-        if crossed.any():
-            height = (points[crossed, 1] - y[k]) / (v[k] - y[k])
-            result[crossed] ^= points[crossed, 0] < x[k] + height * (u[k] - x[k])
-    return result

@@ -11,7 +11,6 @@ from scipy.spatial import Delaunay, cKDTree
 
 from hood.assets.pattern.making import Fastener, construction_of, laid
 from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
-from hood.assets.pattern.riding import in_triangles, inside
 from hood.mesh import topology
 from hood.mesh.flat import Construction, in_triangles, inside
 

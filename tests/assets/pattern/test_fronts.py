@@ -8,7 +8,7 @@ import pytest
 from hood.assets.body.body import Body
 from hood.assets.garment.fasteners import ROOM
 from hood.assets.pattern.designs import draft
-from hood.assets.pattern.fronts import CLOSED, opened
+from hood.assets.pattern.fronts import CLOSURES, opened
 from hood.assets.pattern.measures import Measures, measure_body
 from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.mesh import topology
@@ -62,8 +62,8 @@ def test_buttons_are_apart_and_a_zip_is_everywhere(measures: Measures) -> None:
         if front == "zip":
             assert len(pairs) == len(cut.rims)
         else:
-            assert np.abs(np.diff(height[1:]) + CLOSED["buttons"].every).max() < 0.02
-            assert height[-1] - cut.pos[cut.rims].min(axis=(0, 1))[1] > 0.5 * CLOSED["buttons"].every
+            assert np.abs(np.diff(height[1:]) + CLOSURES["buttons"].every).max() < 0.02
+            assert height[-1] - cut.pos[cut.rims].min(axis=(0, 1))[1] > 0.5 * CLOSURES["buttons"].every
 
 
 def test_a_closed_front_is_one_panel(measures: Measures) -> None:
