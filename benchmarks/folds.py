@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--words", nargs="+", default=[], help="further words of hood rollout, such as wind=0")
     parser.add_argument("--output", type=Path, default=Path("outputs/folds"))
     chosen = parser.parse_args()
-    table = {}
+    table: dict[str, np.ndarray] = {}
     for fabric in chosen.fabrics:
         rows = []
         for phase in PHASES[: chosen.meshes]:
@@ -182,9 +182,9 @@ def main() -> None:
             rows.append(figures(path))
         table[fabric] = np.array(rows)
     print(f"{chosen.design + ' ' + str(chosen.vertices):16}" + "".join(f"{name:>18}" for name in FIGURES))
-    for fabric, rows in table.items():
-        spread = rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(rows.shape[1])
-        cells = zip(rows.mean(axis=0), spread, strict=True)
+    for fabric, values in table.items():
+        spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
+        cells = zip(values.mean(axis=0), spread, strict=True)
         print(f"{fabric:16}" + "".join(f"{mean:11.1f} ±{more:5.1f}" for mean, more in cells))
     for one, two in zip(chosen.fabrics[:-1], chosen.fabrics[1:], strict=True) if chosen.meshes > 1 else ():
         error = np.sqrt((table[one].var(axis=0, ddof=1) + table[two].var(axis=0, ddof=1)) / chosen.meshes + 1e-12)

@@ -119,7 +119,7 @@ SLOW = (
     (r"^rollout .*plie fabrics={below", "fabrics by part, as on the page of sizes, and woven ones"),
     (r"^rollout .*size=1\.1 stepper", "a factor, as of the line with three"),
     (r"^rollout .*fields:\[rg\].* refine=0", "the same with refine=5"),
-    (r"^rollout garment=dress_4k .*material=silk", "a fabric by name, as of the README"),
+    (r"^rollout garment=swing_4k .*material=silk", "a fabric by name, as of the README"),
     (r"^train -m ", "sweeps, which have tests of their own, as have the two launchers"),
     (r"^train weights=quickstart model=", "weights to start from, as by experiment=quickstart"),
     (r"^plan garment=dress sequence", "the scene of a plan, as of hood plan alone"),

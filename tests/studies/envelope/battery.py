@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from hood.app.common import weigh
 from hood.app.notices import heard
 from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene, make_stepper
 from hood.app.stepping.cloth_contact import potential_of
 from hood.app.stepping.guarding import guard_sentence, make_guard
@@ -130,8 +131,8 @@ class Battery:
     def _stepper(self, config: DictConfig, method: str) -> Stepper:
         """Weights are read once."""
         if method == "newton":
-            return make_stepper(config)[0]
-        self._network = self._network or make_stepper(config)[0]
+            return make_stepper(RolloutSettings.of(config))[0]
+        self._network = self._network or make_stepper(RolloutSettings.of(config))[0]
         weigh(self._network, config)
         return self._network
 
