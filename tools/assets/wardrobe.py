@@ -28,11 +28,10 @@ _POSITION, _SHAPE, _WEIGHT = 2.0**-16, 2.0**-12, 2.0**-9
 
 
 class Piece(NamedTuple):
-    """A garment of the wardrobe: a design with its options, and the elastic of its waist as ``hood sew waist=`` takes it."""
+    """A garment of the wardrobe: a design with its options."""
 
     design: str
     options: Mapping[str, Any] = {}
-    waist: str = "auto"
 
 
 WARDROBE = {
@@ -90,7 +89,7 @@ def _sew(piece: Piece, edge: float, path: Path) -> None:
     options = ",".join(f"{key}:{value}" for key, value in piece.options.items())
     with tempfile.TemporaryDirectory() as folder:
         sewn = Path(folder) / path.name
-        words = ["sew", f"design:{piece.design}", f"output={sewn}", f"edge={edge}", f"waist={piece.waist}", "sheet=none"]
+        words = ["sew", f"design:{piece.design}", f"output={sewn}", f"edge={edge}", "sheet=none"]
         if run_hood([*words, *([f"design={{{options}}}"] if options else [])]):
             raise RuntimeError(f"{path.stem} is not sewn well at edge={edge}")
         write_rounded(path, load_garment(sewn))

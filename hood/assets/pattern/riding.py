@@ -29,8 +29,6 @@ _CLOTH, _HIGHER, _BUTTON = 1.5e-3, 5e-4, 3.5e-3
 _STEP, _FOOT = 8e-3, 0.1
 #: Less than this [m²] is no triangle.
 _NO_AREA = 1e-9
-#: Pairs of points and triangles that are looked at at once.
-_AT_ONCE = 1 << 21
 #: What a button measures that does not say [m], and the corners of its outline.
 _RADIUS, _CORNERS = 9e-3, 16
 
