@@ -1,6 +1,7 @@
 """The moving picture of the README, from a rollout: ``python scripts/readme_picture.py rollout.h5 docs/images/dress.gif``.
 
-The one in the README is of ``hood rollout garment=dress_4k sequence=dance_mixed num_frames=75 metrics=none``.
+The one in the README is of
+``hood rollout garment=swing_4k material=silk_crepe sequence=dance_mixed num_frames=75 stepper=newton metrics=none``.
 """
 
 from __future__ import annotations
