@@ -1,21 +1,23 @@
 """The picture of docs/gallery.md, the wardrobe, a fabric each: ``python scripts/gallery.py docs/images/gallery.png``.
 
-Each is simulated by the solver at 4,000 vertices, and shown where it has come in the same moment of the same dance; the last
-row is one of them in three fabrics more.
+Each is simulated by the solver at 4,000 vertices, and shown where it has come in the same moment of the same dance.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-import hood
+from hood.cli.main import main as run_hood
 from hood.media.film import Film
 from hood.media.renderer.render import contact_sheet
-from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.reader import read_rollout
 
 #: Garments and their fabrics.
 WORN = (
@@ -45,16 +47,14 @@ _LEVEL = 6  # channels are multiples of it, which the eye hardly sees and halves
 
 
 def still(garment: str, fabric: str) -> np.ndarray:
-    """The last frame (H, W, 3) uint8 of a garment in a fabric."""
-    simulation = hood.simulate(
-        f"{garment}_4k", SEQUENCE, material=fabric, stepper="newton", num_frames=NUM_FRAMES, metrics="none", guard="off"
-    )
-    *_, last = simulation
-    body, cloth = last.body_pos.numpy(), last.world_pos.numpy()
-    worn = simulation.scene.garment
-    said = {"garment": worn.name, "fabric_names": fabric}
-    data = RolloutData(cloth[None], worn.faces, worn.rest_pos, body[None], simulation.scene.motion.faces, np.zeros(1), {}, said)
-    return Film(data, _WIDTH, _HEIGHT, azimuth_deg=_AZIMUTH).picture(0)
+    """The last frame (H, W, 3) uint8 of a garment in a fabric, with its pockets and buttons."""
+    words = f"garment={garment}_4k sequence={SEQUENCE} material={fabric} stepper=newton num_frames={NUM_FRAMES} fail_on=nothing"
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        target = Path(folder, "rollout")
+        if run_hood(["rollout", *words.split(), "metrics=none", "video=none", "sheet=false", f"output={target}"]):
+            raise RuntimeError(f"no rollout of {garment}_4k in {fabric}")
+        data = read_rollout(target / "rollout.h5")
+    return Film(data, _WIDTH, _HEIGHT, azimuth_deg=_AZIMUTH).picture(NUM_FRAMES - 1)
 
 
 def draw(picture: Path) -> None:
