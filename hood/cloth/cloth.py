@@ -264,6 +264,64 @@ def build_cloth(
     )
 
 
+def with_values(cloth: Cloth, rest_pos: Tensor | None = None, flat: Tensor | None = None, **fabric: Tensor | float) -> Cloth:
+    """The cloth with another fabric or rest shape, as a function of these that autograd follows.
+
+    Args:
+        rest_pos: (V, 3) m. Of a cloth with a flat pattern it plays no role in the energies but for the angles.
+        flat: (F, 2, 2) m, edges of the faces in the flat pattern, of a cloth that has one.
+        fabric: ``density`` [kg/m²], ``lame_mu``, ``lame_lambda`` [Pa], ``thickness`` [m] on faces, ``bending_stiffness`` [J] on
+            hinges, ``friction`` on vertices: one number or as many.
+
+    Raises:
+        ValueError: a name is none of these, a length does not fit, or the fabric has a warp and the rest shape changes.
+
+    Examples:
+        >>> import numpy as np, torch, hood
+        >>> faces = np.array([[0, 1, 2]])
+        >>> cloth = build_cloth(np.eye(3), faces, hood.Material(), dtype=torch.float64)
+        >>> density = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+        >>> with_values(cloth, density=density).mass.sum().backward()
+        >>> round(float(density.grad), 4)  # the area
+        0.866
+    """
+    fields = {"bending_stiffness": cloth.hinge_area, "friction": cloth.mass}
+    changed: dict[str, Tensor] = {}
+    for name, value in fabric.items():
+        if name not in ("density", "lame_mu", "lame_lambda", "thickness", *fields):
+            raise ValueError(f"cloth: {name!r} is no number of a fabric; give density, lame_mu, lame_lambda, thickness, "
+                             "bending_stiffness or friction")  # fmt: skip
+        like = fields.get(name, cloth.rest_area)
+        given = torch.as_tensor(value, dtype=like.dtype)
+        if given.shape not in ((), like.shape):
+            raise ValueError(f"cloth: {name} has the shape {tuple(given.shape)}; give one number or {tuple(like.shape)}")
+        changed[name] = given.expand(like.shape)
+    density = changed.get("density", cloth.density)
+    if (rest_pos is not None or flat is not None) and cloth.weave is not None:
+        raise ValueError("cloth: its fabric has a warp; the rest shape of an isotropic one can be changed")
+    if flat is not None and cloth.flat is None:
+        raise ValueError("cloth: it has no flat pattern; give rest_pos")
+    if cloth.flat is not None:
+        shape = cloth.flat if flat is None else flat
+        if flat is not None or "density" in changed:
+            changed |= rest_of(shape, cloth.faces, cloth.hinges, density, cloth.num_vertices)
+    elif rest_pos is not None or "density" in changed:
+        pos = cloth.rest_pos if rest_pos is None else rest_pos
+        changed["mass"] = geometry.vertex_masses(pos, cloth.faces, density)
+    if rest_pos is not None:
+        changed |= {"rest_pos": rest_pos, "rest_angle": geometry.dihedral_angles(rest_pos, cloth.hinges)}
+        if cloth.flat is None:
+            area = geometry.triangle_areas(rest_pos, cloth.faces)
+            owners = torch.as_tensor(topology.hinges(cloth.faces.cpu().numpy()).faces, device=area.device)
+            changed |= {
+                "rest_area": area,
+                "rest_inverse": geometry.rest_inverse(rest_pos, cloth.faces),
+                "hinge_rest_length": (rest_pos[cloth.hinges[:, 1]] - rest_pos[cloth.hinges[:, 0]]).norm(dim=1),
+                "hinge_area": area[owners].sum(dim=1),
+            }
+    return replace(cloth, **changed)
+
+
 def concatenate_cloths(cloths: Sequence[Cloth]) -> Cloth:
     """Several cloths as one flat batch; scene *i* of the result is the *i*-th scene of the inputs in order."""
     counts = {"vertices": [c.num_vertices for c in cloths], "scenes": [c.num_scenes for c in cloths]}

@@ -6,7 +6,7 @@ a step that needs body edges alone is spared the triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -119,6 +119,59 @@ def _match_folds(pos: Tensor, vertex_scene: Tensor, obstacle: Obstacle, contact:
     match = match_surface(ahead, vertex_scene, obstacle, curved=True)
     other = near_enough & _is_other(match, obstacle, contact.point, contact.normal)
     return match._replace(dist=_plane_dist(pos, match)), other
+
+
+def moving_contacts(
+    contact: Contact, second: SecondContact | None, pos: Tensor, obstacle: Obstacle
+) -> tuple[Contact, SecondContact | None]:
+    """Contacts of positions ``pos`` (V, 3) at t as functions of these and of the body, which autograd follows.
+
+    Their closest points stay on the faces, edges and vertices of the body that they were found on. The values are those of the
+    searches, to rounding.
+    """
+    near = _moving(contact, pos, obstacle)
+    dist = torch.copysign((pos - near.point).norm(dim=1), contact.dist)
+    first = replace(near, dist=torch.where(contact.valid & (contact.dist != 0), dist, contact.dist))
+    if second is None or second.contact is None:
+        return first, second
+    other = _moving(second.contact, _ahead(pos, first), obstacle)
+    dist = ((pos - other.point) * other.normal).sum(dim=1)
+    return first, SecondContact(replace(other, dist=torch.where(other.valid, dist, other.dist)))
+
+
+def _moving(contact: Contact, at: Tensor, obstacle: Obstacle) -> Contact:
+    """A contact whose closest points follow the positions ``at`` (V, 3) and the body."""
+    face = torch.where(contact.valid, contact.face, 0)
+    bary = torch.where(contact.valid.unsqueeze(1), _weights(at, obstacle.pos[obstacle.faces[face]], contact.bary), 1.0 / 3.0)
+    hit = SurfaceHit(contact.vertex, contact.vertex_dist, face, bary, contact.dist)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    match, row = _match_of(hit, obstacle, incidence), contact.valid.unsqueeze(1)
+    names = ("bary", "point", "normal", "next_point", "next_normal")
+    moved = {name: torch.where(row, getattr(match, name), getattr(contact, name)) for name in names}
+    curvature = torch.where(contact.valid, _matched_curvature(match, obstacle, incidence), contact.curvature)
+    return replace(contact, curvature=curvature, **moved)
+
+
+def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
+    """Weights (N, 3) of the points of triangles ``corners`` (N, 3, 3) that are nearest to ``at`` (N, 3), on the face, the edge or
+    at the corner that the ``known`` weights (N, 3) are on."""
+    first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], at - corners[:, 0]
+    a, b, c = (first * first).sum(1), (first * second).sum(1), (second * second).sum(1)
+    p, q = (first * offset).sum(1), (second * offset).sum(1)
+    area = a * c - b * b
+    inside = (known > 0).all(dim=1)
+    area = torch.where(inside, area, 1.0)
+    u, v = (c * p - b * q) / area, (a * q - b * p) / area
+    found = torch.where(inside.unsqueeze(1), torch.stack([1.0 - u - v, u, v], dim=1), known)
+    for corner in range(3):
+        start, end = (corner + 1) % 3, (corner + 2) % 3
+        on = (known[:, corner] <= 0) & (known[:, start] > 0) & (known[:, end] > 0)
+        edge, way = corners[:, end] - corners[:, start], at - corners[:, start]
+        share = (edge * way).sum(1) / torch.where(on, (edge * edge).sum(1), 1.0)
+        column = [torch.zeros_like(share)] * 3
+        column[start], column[end] = 1.0 - share, share
+        found = torch.where(on.unsqueeze(1), torch.stack(column, dim=1), found)
+    return found
 
 
 def find_static_second_contact(

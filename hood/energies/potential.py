@@ -67,12 +67,18 @@ class Potential:
         Args:
             compiled: may leave torch; False where a graph is recorded or traced.
         """
-        if problem.internal_force is not None or not any(_needs_internal_force(term, problem) for term in self.terms.values()):
+        pulling = self.asked_internal(problem)
+        if pulling is None:
             return problem
         pos = problem.state.pos
-        pulling = Potential({name: term for name, term in self.terms.items() if _counts_as_internal(term, problem)})
         by = energies_and_gradient if compiled else Potential.gradient
         return replace(problem, internal_force=-by(pulling, problem, pos)[0].to(pos.dtype))
+
+    def asked_internal(self, problem: StepProblem) -> Potential | None:
+        """The terms whose forces at x_t :meth:`with_internal_force` is asked for; None where that is done or nobody asks."""
+        if problem.internal_force is not None or not any(_needs_internal_force(term, problem) for term in self.terms.values()):
+            return None
+        return Potential({name: term for name, term in self.terms.items() if _counts_as_internal(term, problem)})
 
     def active(self, problem: StepProblem) -> dict[str, Term]:
         """The terms that can be anything but a constant zero for a prepared ``problem``."""

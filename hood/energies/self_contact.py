@@ -98,7 +98,6 @@ class LayerFriction(Energy):
         energy = grips.force * mollified_norm(_dot(slip, slip), grips.limit)
         return sum_per_scene(energy, grips.scene, problem.num_scenes)
 
-    @torch.no_grad()
     def grips(self, problem: StepProblem) -> LayerGrips:
         """What grips what during the step; the problem must have been prepared."""
         pairs = _pairs(problem)
@@ -145,6 +144,9 @@ def _scene_pairs(scene: SceneLayers, pos: Tensor, index: int) -> tuple[Tensor, .
     weights = torch.as_tensor(found.weights, device=device)
     edges = torch.as_tensor(found.edges, device=device)
     x = pos[corners]
+    if x.requires_grad:
+        moved = nearest_weights(x, weights, edges)
+        weights = weights + (moved - moved.detach())
     gap = (weights.unsqueeze(2) * x).sum(dim=1)
     dist = torch.linalg.vector_norm(gap, dim=1).clamp_min(1e-12)
     reach, area, parallel = (torch.as_tensor(values, device=device) for values in (found.reach, found.area, found.parallel))
@@ -180,15 +182,43 @@ def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
     cloth = problem.cloth
     there = torch.where(cloth.free.unsqueeze(1), ballistic_position(problem), _held(problem))
     inertia = cloth.mass.double() / problem.vertex_dt.squeeze(1).double() ** 2
+    backing = ~cloth.free | _on_body(problem)
     vectors = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there)
+    if any(values.requires_grad for values in vectors):
+        return _followed_pressing(pairs, inertia, there, problem.internal_force, backing)
     arrays = [np.ascontiguousarray(values.cpu().numpy(), np.int64) for values in (pairs.corners, pairs.edges)]
     arrays += [np.ascontiguousarray(values.double().cpu().numpy()) for values in vectors]
     pull = None if problem.internal_force is None else np.ascontiguousarray(problem.internal_force.double().cpu().numpy())
-    backed = np.ascontiguousarray((~cloth.free | _on_body(problem)).cpu().numpy(), np.uint8)
+    backed = np.ascontiguousarray(backing.cpu().numpy(), np.uint8)
     pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
     pressing = np.empty(len(pairs.force))
     library().layers_pressing(ctypes.byref(_Pressing(len(pressing), len(there), *pointers)), pressing.ctypes.data)
     return torch.from_numpy(pressing).to(pairs.force.device)
+
+
+def _followed_pressing(pairs: _Pairs, inertia: Tensor, there: Tensor, pull: Tensor | None, backed: Tensor) -> Tensor:
+    """The same as a function that autograd follows."""
+    load = pairs.weights * pairs.force.unsqueeze(1)  # (N, 4) N, at the corners
+    rows, normal = pairs.corners.reshape(-1), pairs.normal
+    pushed = load.unsqueeze(2) * normal.unsqueeze(1)
+    net = torch.zeros_like(there).index_add(0, rows, pushed.reshape(-1, 3))
+    spread = (load.abs().unsqueeze(2).unsqueeze(3) * (normal.unsqueeze(2) * normal.unsqueeze(1)).unsqueeze(1)).reshape(-1, 3, 3)
+    spread = there.new_zeros(len(there), 3, 3).index_add(0, rows, spread)
+    missing = (pairs.reach - ((pairs.weights.unsqueeze(2) * there[pairs.corners]).sum(dim=1) * normal).sum(dim=1)).clamp_min(0.0)
+    first = torch.arange(4, device=rows.device) < torch.where(pairs.edges, 2, 1).unsqueeze(1)  # (N, 4) corners of the first side
+    outward = torch.where(first, 1.0, -1.0).unsqueeze(2) * normal.unsqueeze(1)  # (N, 4, 3)
+    one = (net[pairs.corners] * outward).sum(dim=2)
+    both = torch.einsum("nci,ncij,ncj->nc", outward, spread[pairs.corners], outward)
+    ahead, behind = (0.5 * (both + one)).clamp_min(0.0), (0.5 * (both - one)).clamp_min(0.0)
+    if pull is not None:
+        behind = behind - ((pull.double() - net)[pairs.corners] * outward).sum(dim=2)
+    part = load.abs()
+    acts = part > 0
+    share = torch.where(acts, part / torch.where(acts, torch.maximum(ahead, part), 1.0), 0.0)
+    brings = share * (inertia[pairs.corners] * missing.unsqueeze(1) + behind.clamp_min(0.0))
+    held = acts & backed[pairs.corners]
+    sides = [(brings * side).sum(dim=1).where(~(held & side).any(dim=1), torch.inf) for side in (first, ~first)]
+    return torch.minimum(*sides)
 
 
 def _held(problem: StepProblem) -> Tensor:
@@ -338,7 +368,11 @@ class LayerBarrier(Energy):
             for values in (found.weights, found.reach, found.area, found.parallel)
         )
         x = next_pos[torch.as_tensor(found.corners + scene.first, device=device)]
-        # The nearest points move along the features, which does not change the distance to first order.
+        if x.requires_grad:
+            # The nearest points move along the features: nothing of first order, a part of the second derivative.
+            edges = torch.as_tensor(found.edges, device=device)
+            moved = nearest_weights(x, weights, edges)
+            weights = weights + (moved - moved.detach())
         gap = (weights.unsqueeze(2) * x).sum(dim=1)
         share = torch.linalg.vector_norm(gap, dim=1).clamp_min(_LEAST) / reach
         energy = self.pressure * area * reach * (1.0 - share) ** 2 * -share.log()
@@ -348,6 +382,44 @@ class LayerBarrier(Energy):
 
     def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> bool:
         return True
+
+
+def nearest_weights(x: Tensor, known: Tensor, edges: Tensor) -> Tensor:
+    """Weights (N, 4) of the corners ``x`` (N, 4, 3) in the gap between the nearest points of vertex and face, or of two edges
+    where ``edges`` (N,) bool, as autograd follows them: on the face, edge or corner that the ``known`` weights (N, 4) are on.
+
+    Parallel edges, whose nearest points are not told apart, keep the known ones.
+    """
+    size = known.abs()
+    rows = torch.arange(len(x), device=x.device)
+    # Of a face: from its corner of the largest weight to the other two; of edges: from their first ends to the second.
+    base = torch.where(edges, 0, 1 + size[:, 1:].argmax(dim=1))
+    first, second = torch.where(edges, 1, 1 + base % 3), torch.where(edges, 3, 1 + (base + 1) % 3)
+    start = x[:, 0] - torch.where(edges.unsqueeze(1), x[:, 2], x[rows, base])
+    one = torch.where(edges.unsqueeze(1), x[:, 1] - x[:, 0], x[rows, base] - x[rows, first])
+    two = torch.where(edges.unsqueeze(1), x[:, 2] - x[:, 3], x[rows, base] - x[rows, second])
+    held = torch.where(edges, size[:, 0] * size[:, 1] == 0, size[rows, first] == 0)
+    still = torch.where(edges, size[:, 2] * size[:, 3] == 0, size[rows, second] == 0)
+    one, two = (torch.where(fixed.unsqueeze(1), 0.0, way) for fixed, way in ((held, one), (still, two)))
+    # Ends that the nearest points are held at beside their starts.
+    ends = edges.unsqueeze(1) & torch.stack([held & (size[:, 1] > 0), still & (size[:, 3] > 0)], dim=1)
+    start = start + torch.where(ends[:, :1], x[:, 1] - x[:, 0], 0.0) + torch.where(ends[:, 1:], x[:, 2] - x[:, 3], 0.0)
+    a, b, c = _dot(one, one) + held.to(x), _dot(one, two), _dot(two, two) + still.to(x)
+    p, q = -_dot(one, start), -_dot(two, start)
+    determinant = a * c - b * b
+    told = determinant > 1e-9 * a * c
+    determinant = torch.where(told, determinant, 1.0)
+    u = torch.where(told, (c * p - b * q) / determinant, 0.0).unsqueeze(1)
+    v = torch.where(told, (a * q - b * p) / determinant, 0.0).unsqueeze(1)
+    u, v = torch.where(ends[:, :1], 1.0, u), torch.where(ends[:, 1:], 1.0, v)
+    of_edges = torch.cat([1.0 - u, u, v - 1.0, -v], dim=1)
+    of_face = torch.zeros_like(of_edges)
+    of_face = of_face.index_put((rows, torch.zeros_like(rows)), torch.ones_like(u[:, 0]))
+    of_face = of_face.index_put((rows, base), (u + v - 1.0)[:, 0])
+    of_face = of_face.index_put((rows, first), -u[:, 0], accumulate=True)
+    of_face = of_face.index_put((rows, second), -v[:, 0], accumulate=True)
+    found = torch.where(edges.unsqueeze(1), of_edges, of_face)
+    return torch.where(told.unsqueeze(1), found, known)
 
 
 def has_layers(potential: Potential) -> bool:

@@ -169,7 +169,6 @@ MOST_CURVATURE = 40.0
 ROUNDS = 2
 
 
-@torch.no_grad()
 def convex_curvature(pos: Tensor, faces: Tensor, incidence: Incidence) -> Tensor:
     """Curvature [1/m] (W,) of the surface at its vertices, between 0 (flat, hollow) and :data:`MOST_CURVATURE`.
 

@@ -45,7 +45,7 @@ from hood.solver.step_figures import (
     vertex_residual,
 )
 from hood.steppers.network import Prediction
-from hood.steppers.newton import Stepper
+from hood.steppers.newton import Stepper, as_taken
 from hood.steppers.protocol import Relaxing, Stopwatch
 from hood.steppers.refined import RefinedStepper, prepare_stepper
 from hood.steppers.static_shapes.simulator import network_of
@@ -177,17 +177,17 @@ def simulate(
         if problem is None or known is None:
             return
         prediction, lap, figures = stepper.predict(problem, prepared, watch), watch.lap(), None
-        known = _as_taken(known, prediction)
+        known = as_taken(known, prediction)
         if wants_potential:
             with watch.aside("metrics"):
                 figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
         if guard is not None and not (relaxing and index == 0):
             with watch.aside("guard"):
-                known = known if wants_potential else _as_taken(potential.prepare(problem), prediction)
+                known = known if wants_potential else as_taken(potential.prepare(problem), prediction)
                 predicted, prediction = prediction, guard.see(index + 1, known, prediction, figures)
             if guard.stopped is not None:
                 return
-            lap, known = _with_guard(lap, watch.spent_aside("guard")), _as_taken(known, prediction)
+            lap, known = _with_guard(lap, watch.spent_aside("guard")), as_taken(known, prediction)
             if prediction is not predicted and wants_potential:
                 with watch.aside("metrics"):
                     figures = StepFigures(potential, known, prediction.next_pos, prediction.acc)
@@ -215,12 +215,6 @@ def _jumps_within(scene: Scene, start_frame: int, count: int) -> dict[int, Jump]
     if within:
         warnings.warn(describe_jumps(scene.motion, within), stacklevel=3)
     return within
-
-
-def _as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
-    """The problem with the contact that its step was taken with in the end."""
-    problem = problem if prediction.entered is None else replace(problem, second_contact=prediction.entered)
-    return problem if prediction.held_off is None else replace(problem, contact=prediction.held_off)
 
 
 #: A start with an edge lengthened by more than this share would snap back in the first frames.

@@ -192,3 +192,9 @@ class NewtonStepper:
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
         return problem.state.vel + problem.vertex_dt * prediction.acc
+
+
+def as_taken(problem: StepProblem, prediction: Prediction) -> StepProblem:
+    """The problem with the contact that its step was taken with in the end."""
+    problem = problem if prediction.entered is None else replace(problem, second_contact=prediction.entered)
+    return problem if prediction.held_off is None else replace(problem, contact=prediction.held_off)

@@ -82,7 +82,7 @@ class Directions:
         if self.linear == "direct" and layers is None:  # a factorisation knows the pattern alone
             return self._solve_direct(triples, inverse, rhs)
         solution, used, failed = conjugate_gradients(
-            _beside(product(self.plan.pattern, triples), layers),
+            beside(product(self.plan.pattern, triples), layers),
             by_blocks(inverse),
             rhs,
             self.plan.scene,
@@ -125,7 +125,7 @@ class Directions:
         return kept
 
 
-def _beside(apply: Callable[[Tensor], Tensor], layers: LayerRows | None) -> Callable[[Tensor], Tensor]:
+def beside(apply: Callable[[Tensor], Tensor], layers: LayerRows | None) -> Callable[[Tensor], Tensor]:
     """``apply`` with what layers add beside the pattern."""
     return apply if layers is None else lambda x: apply(x) + layers.couple(x)
 

@@ -1,0 +1,276 @@
+"""Implicit Euler steps that torch differentiates: derivatives of a minimum by the implicit function theorem.
+
+At the minimum x of the incremental potential Φ(x, p) no free vertex feels a force, ∂Φ/∂x = 0, whatever the parameters p are:
+fabric, rest shape, state at t, body, targets of pins, gravity, constants of the energies. So
+
+    dx/dp = −H⁻¹ ∂²Φ/∂x∂p,  H = ∂²Φ/∂x²,
+
+and a loss L(x) is differentiated by one linear system: H λ = ∂L/∂x, ∂L/∂p = −λ · ∂²Φ/∂x∂p. H is the Hessian itself, by autograd,
+not the positive matrix that the solver takes its steps with; that one, with its indefinite part, is the preconditioner.
+
+The minimum is the solver's, bit for bit. What is kept of a step are its state and its contacts; everything else is computed
+again backwards. Which points of the body are nearest, and which side of a fold counts, is constant in the derivative, as it is
+in the step; where they are, and the lagged forces of friction, are not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from hood.cloth.cloth import Cloth
+from hood.cloth.state import State, StepInput
+from hood.contact.contact import moving_contacts
+from hood.energies.potential import Potential
+from hood.energies.problem import StepProblem
+from hood.solver.derivatives.self_contact import grips_of, layers_of
+from hood.solver.derivatives.step_terms import StepTerms
+from hood.solver.system.iterate import fixed_positions
+from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
+from hood.solver.system.plan import ModelBuilder, plan_for
+from hood.steppers.newton import NewtonStepper, as_taken
+from hood.tensors.batch import made_of
+
+T = TypeVar("T")
+
+#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian; each is
+#: preconditioned by a system with the solver's matrix, solved to the second number.
+_TOLERANCE, _INNER = 1e-10, 1e-3
+_MOST_PRODUCTS, _MOST_INNER = 200, 4000
+
+
+def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
+    """The state at t + 1: the solver's, differentiable by every tensor of ``problem`` that requires a gradient.
+
+    Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
+    and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
+    tensors, such as ``Friction(coefficient)``. A step that misses the minimum has the derivative of the minimum nearby, and
+    ``rg`` of the solver's target says how near; give 1e-6 or less.
+
+    Raises:
+        ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
+
+    Examples:
+        >>> import numpy as np, torch, hood
+        >>> from hood.cloth.cloth import build_cloth, with_values
+        >>> from hood.cloth.state import State, StepInput
+        >>> from hood.energies.problem import StepProblem
+        >>> from hood.steppers.newton import NewtonStepper
+        >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
+        >>> held = np.array([True, True, False, False])
+        >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+        >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
+        >>> state = State(torch.as_tensor(pos), torch.zeros(4, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
+        >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
+        >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
+        >>> after.pos[3, 1].backward()
+        >>> bool(mu.grad > 0)  # harder cloth hangs higher
+        True
+    """
+    given = _given(problem, stepper.potential)
+    wrong = next((tensor for tensor in given if tensor.dtype != torch.float64), None)
+    if wrong is not None or problem.state.pos.dtype != torch.float64:
+        found = problem.state.pos.dtype if wrong is None else wrong.dtype
+        raise ValueError(f"differentiable step: a tensor is {found}; give cloth, state and parameters in torch.float64")
+    solved = _Solved(stepper, problem, given)
+    pos = _Minimum.apply(solved, *given)
+    change = (pos - problem.state.pos) / problem.vertex_dt
+    # The velocity is the solver's to the last bit, its derivative that of the difference.
+    vel = change + (solved.vel - change).detach()
+    return State(pos, vel, problem.state.origin)
+
+
+def differentiable_rollout(stepper: NewtonStepper, problem: StepProblem, steps: Iterable[StepInput]) -> Iterator[State]:
+    """States after each of ``steps``, from the state of ``problem``, each differentiable by all that came before; see
+    :func:`differentiable_step`. Their frame is that of ``problem``."""
+    for step in steps:
+        state = differentiable_step(stepper, replace(problem, step=step))
+        problem = replace(problem, state=state)
+        yield state
+
+
+class _Solved:
+    """A step that was taken, and its adjoint."""
+
+    def __init__(self, stepper: NewtonStepper, problem: StepProblem, given: tuple[Tensor, ...]) -> None:
+        self.problem, self.potential, self.ids = problem, stepper.potential, [id(one) for one in given]
+        plain = {key: tensor.detach() for key, tensor in zip(self.ids, given, strict=True)}
+        self._plain = _with_tensors(stepper.potential, plain, number=True)
+        fixed = replace(_swapped(problem, plain), cloth=_detached(problem.cloth, plain))
+        own = NewtonStepper(self._plain, stepper.settings)
+        with torch.no_grad():
+            fixed = own.search(fixed)
+            prediction = own.predict(fixed, None)
+            self.taken = as_taken(fixed, prediction)
+            self.pos, self.vel = prediction.next_pos, own.next_velocity(fixed, prediction)
+        self._check()
+
+    def _check(self) -> None:
+        if self.taken.point_contacts:
+            raise ValueError("differentiable step: contact acts at edges or faces; give terms with contact='vertices'")
+        step = self.problem.step
+        if step.pin_target is not None and self.taken.step.pin_target is not None:
+            held = self.problem.cloth.pinned
+            if not torch.equal(step.pin_target[held], self.taken.step.pin_target[held]):
+                raise ValueError(
+                    "differentiable step: cloth is in the way of held vertices, which do not reach their targets in the step; "
+                    "give targets nearer by, or shorter steps"
+                )
+
+    @torch.enable_grad()
+    def pull_back(self, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Derivatives of a loss by what was given, of that ``grad`` (V, 3) by the positions."""
+        originals = _given(self.problem, self.potential)
+        leaves = [tensor.detach().requires_grad_() for tensor in originals]
+        table = dict(zip(self.ids, leaves, strict=True))
+        potential = _with_tensors(self.potential, table)
+        problem = _with_contacts(potential, _swapped(self.problem, table), self.taken)
+        pos, free = self.pos.detach().requires_grad_(), problem.cloth.free.unsqueeze(1)
+        fixed = fixed_positions(problem)
+        energy = potential.total(problem, torch.where(free, pos, fixed)).sum()
+        (force,) = torch.autograd.grad(energy, pos, create_graph=True)
+
+        def hessian(x: Tensor) -> Tensor:
+            (there,) = torch.autograd.grad(force, pos, x, retain_graph=True)
+            return there
+
+        adjoint = self._solve(hessian, torch.where(free, grad, 0.0))
+        value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * force).sum()
+        if not value.requires_grad:
+            return tuple(None for _ in leaves)
+        return torch.autograd.grad(value, leaves, allow_unused=True)
+
+    def _solve(self, hessian: Callable[[Tensor], Tensor], rhs: Tensor) -> Tensor:
+        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients, preconditioned by the solver's matrix."""
+        with torch.no_grad():
+            problem, plan = self.taken, plan_for(self.taken)
+            layers, grips = layers_of(self._plain, problem), grips_of(self._plain, problem)
+            build = ModelBuilder(StepTerms(self._plain, problem), plan, layers, grips)
+            model = build(self.pos, problem.acceleration(self.pos))
+        parts = model.triples + model.indefinite_part, model.triples
+        exact, positive = (beside(product(plan.pattern, triples), model.layers) for triples in parts)
+        inverse = by_blocks(diagonal_inverse(plan.pattern, model.triples))
+        tolerance = torch.full((problem.num_scenes,), _INNER, dtype=rhs.dtype)
+
+        def precondition(r: Tensor) -> Tensor:
+            for apply in (exact, positive):
+                near = r[plan.vertices], plan.scene, problem.num_scenes, tolerance, _MOST_INNER
+                found, _, indefinite = conjugate_gradients(apply, inverse, *near)
+                if not bool(indefinite.any()):
+                    break
+            return torch.zeros_like(r).index_copy(0, plan.vertices, found)
+
+        found, met = _flexible(hessian, precondition, rhs)
+        if not met:
+            warnings.warn(
+                "differentiable step: the adjoint system was not solved to 1e-10: the step has not ended at a minimum, or a "
+                "contact sets in there; its derivative is less exact",
+                stacklevel=2,
+            )
+        return found
+
+
+class _Minimum(torch.autograd.Function):
+    """Positions of a step that was taken, as a function of what was given."""
+
+    @staticmethod
+    def forward(ctx: Any, solved: _Solved, *given: Tensor) -> Tensor:
+        ctx.solved = solved
+        return solved.pos.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return (None, *ctx.solved.pull_back(grad))
+
+
+def _flexible(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], rhs: Tensor) -> tuple[Tensor, bool]:
+    """Solution of a symmetric system by conjugate gradients whose preconditioner may differ from time to time (Notay, "Flexible
+    conjugate gradients", 2000), and whether it was met."""
+    x, r = torch.zeros_like(rhs), rhs.clone()
+    limit = _TOLERANCE * rhs.norm()
+    p = q = None
+    for _ in range(_MOST_PRODUCTS):
+        if not r.norm() > limit:
+            return x, True
+        z = precondition(r)
+        if p is not None and q is not None:
+            z = z - (z * q).sum() / (p * q).sum() * p
+        p, q = z, apply(z)
+        curvature = (p * q).sum()
+        if not curvature > 0:
+            return x, False
+        length = (p * r).sum() / curvature
+        x, r = x + length * p, r - length * q
+    return x, not bool(r.norm() > 1e3 * limit)
+
+
+def _with_contacts(potential: Potential, problem: StepProblem, taken: StepProblem) -> StepProblem:
+    """The problem with the contacts that its step was taken with, following body and cloth."""
+    obstacle, problem = problem.step.obstacle, replace(problem, layers=taken.layers)
+    if obstacle is not None and taken.contact is not None:
+        contact, second = moving_contacts(taken.contact, taken.second_contact, problem.state.pos, obstacle)
+        problem = replace(problem, contact=contact, second_contact=second)
+    internal = potential.asked_internal(problem)
+    if internal is None:
+        return problem
+    pos = problem.state.pos
+    at = pos if pos.requires_grad else pos.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(internal.total(problem, at).sum(), at, create_graph=True)
+    return replace(problem, internal_force=-slope)
+
+
+def _detached(cloth: Cloth, plain: Mapping[int, Tensor]) -> Cloth:
+    """The cloth without gradients: one and the same object whenever asked, which solvers remember their tables by."""
+    made = made_of(cloth)
+    if "detached" not in made:
+        made["detached"] = _swapped(cloth, plain)
+    found = made["detached"]
+    assert isinstance(found, Cloth)
+    return found
+
+
+def _given(problem: StepProblem, potential: Potential) -> tuple[Tensor, ...]:
+    """Tensors that require a gradient, each once."""
+    found: dict[int, Tensor] = {}
+    _collect(problem, found)
+    for term in potential.terms.values():
+        for value in vars(term).values():
+            _collect(value, found)
+    return tuple(found.values())
+
+
+def _collect(item: object, found: dict[int, Tensor]) -> None:
+    if isinstance(item, Tensor):
+        if item.requires_grad:
+            found[id(item)] = item
+    elif is_dataclass(item):
+        for spec in fields(item):
+            _collect(getattr(item, spec.name), found)
+
+
+def _swapped(item: T, table: Mapping[int, Tensor]) -> T:
+    """``item`` with its tensors replaced by those of the table, by what they are; itself where none is."""
+    if isinstance(item, Tensor):
+        return table.get(id(item), item)  # type: ignore[return-value]
+    if not is_dataclass(item) or isinstance(item, type):
+        return item
+    there = {spec.name: getattr(item, spec.name) for spec in fields(item)}
+    changed = {name: new for name, old in there.items() if (new := _swapped(old, table)) is not old}
+    return replace(item, **changed) if changed else item
+
+
+def _with_tensors(potential: Potential, table: Mapping[int, Tensor], number: bool = False) -> Potential:
+    """The potential with constants of its terms replaced by those of the table, as numbers where asked."""
+    terms = dict(potential.terms)
+    for name, term in terms.items():
+        new = {key: table[id(value)] for key, value in vars(term).items() if id(value) in table}
+        if new:
+            terms[name] = copy(term)
+            vars(terms[name]).update({key: float(value) if number and value.ndim == 0 else value for key, value in new.items()})
+    return potential.only(terms)
