@@ -21,6 +21,7 @@ _HOMES = {
     "Simulation": "hood.api",
     "rollout": "hood.api",
     "dress": "hood.api",
+    "differentiable": "hood.api",
     "export": "hood.api",
     "train": "hood.api",
     "load_model": "hood.api",

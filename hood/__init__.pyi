@@ -1,5 +1,6 @@
 from hood.api import (
     Simulation as Simulation,
+    differentiable as differentiable,
     dress as dress,
     export as export,
     load_model as load_model,

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from hood.app.common import load_stepper
@@ -32,12 +34,16 @@ from hood.assets.garment.garment import Garment, checked_garment
 from hood.assets.material import Material
 from hood.assets.motion.animated_mesh import BodyMesh
 from hood.assets.motion.sequence import PoseSequence, checked_sequence
+from hood.cloth.cloth import with_values
+from hood.cloth.state import State
 from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
+from hood.rollouts.differentiable import differentiable_states
 from hood.rollouts.frame import Frame
 from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper
-from hood.steppers.newton import Stepper, require_stepper
+from hood.steppers.newton import NewtonStepper, Stepper, require_stepper
+from hood.tensors.batch import to_device
 
 
 class Simulation:
@@ -161,6 +167,55 @@ def simulate(
         taken = make_stepper(config)[0] if isinstance(stepper, str) else stepper
         ready = set_up(config, taken, own, tell=notes.append)
     return Simulation(ready, [*told, *notes], progress)
+
+
+def differentiable(
+    simulation: Simulation,
+    num_frames: int | None = None,
+    gravity: Tensor | None = None,
+    potential: Potential | None = None,
+    rest_pos: Tensor | None = None,
+    flat: Tensor | None = None,
+    **fabric: Tensor | float,
+) -> Iterator[State]:
+    """States of the frames 1, 2, … of a simulation by the solver, as functions that torch differentiates.
+
+    Every step ends at the minimum of one known potential, so that its derivative is exact (implicit function theorem): contact,
+    friction, layers of cloth and air included, to the accuracy that ``solver.target_rg`` asks for. What is nearest to what, and
+    frame 0, are constant. Memory grows by the states and contacts of the frames. Everything is float64.
+
+    Args:
+        simulation: by ``stepper="newton"``.
+        num_frames: including frame 0; default those of the simulation.
+        gravity: (3,) m/s².
+        potential: with constants that are tensors; default that of the simulation.
+        rest_pos, flat: (V, 3) and (F, 2, 2) m, the rest shape; see :func:`hood.cloth.cloth.with_values`.
+        fabric: ``lame_mu``, ``density``, …: one number or as many as there are faces, hinges (``bending_stiffness``) or
+            vertices (``friction``).
+
+    Yields:
+        :class:`hood.cloth.state.State`; where the cloth is in the world, (V, 3) m, is ``state.origin + state.pos``.
+
+    Raises:
+        ValueError: another stepper, a value that does not fit, an event that cuts the cloth, or a body that jumps.
+
+    Examples:
+        >>> import hood, torch
+        >>> mu = torch.tensor(23600.0, dtype=torch.float64, requires_grad=True)
+        >>> simulation = hood.simulate("tank", "plie", num_frames=3, stepper="newton")
+        >>> *_, last = hood.differentiable(simulation, lame_mu=mu)
+        >>> last.pos[:, 1].mean().backward()
+        >>> bool(mu.grad > 0)  # harder cloth hangs higher
+        True
+    """
+    stepper = simulation.stepper
+    if not isinstance(stepper, NewtonStepper):
+        raise ConfigError(f"simulation: its steps are taken by {type(stepper).__name__}; give hood.simulate(stepper='newton')")
+    stepper = stepper if potential is None else NewtonStepper(potential, stepper.settings)
+    count = simulation.num_frames if num_frames is None else min(num_frames, simulation.num_frames)
+    start = next(iter(simulation)).state
+    cloth = with_values(to_device(simulation.scene.cloth, dtype=torch.float64), rest_pos, flat, **fabric)
+    return differentiable_states(stepper, simulation.scene, start, count - 1, cloth, gravity)
 
 
 def _own(garment: Any, body: Any, sequence: Any, material: Any) -> tuple[Own, dict[str, Any]]:

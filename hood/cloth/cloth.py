@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -286,7 +287,7 @@ def with_values(cloth: Cloth, rest_pos: Tensor | None = None, flat: Tensor | Non
         0.866
     """
     fields = {"bending_stiffness": cloth.hinge_area, "friction": cloth.mass}
-    changed: dict[str, Tensor] = {}
+    changed: dict[str, Any] = {}
     for name, value in fabric.items():
         if name not in ("density", "lame_mu", "lame_lambda", "thickness", *fields):
             raise ValueError(f"cloth: {name!r} is no number of a fabric; give density, lame_mu, lame_lambda, thickness, "

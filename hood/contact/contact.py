@@ -153,8 +153,8 @@ def _moving(contact: Contact, at: Tensor, obstacle: Obstacle) -> Contact:
 
 
 def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
-    """Weights (N, 3) of the points of triangles ``corners`` (N, 3, 3) that are nearest to ``at`` (N, 3), on the face, the edge or
-    at the corner that the ``known`` weights (N, 3) are on."""
+    """Weights (N, 3) of the points of triangles ``corners`` (N, 3, 3) nearest to ``at`` (N, 3), on the face, the edge or at the
+    corner that the ``known`` weights (N, 3) are on."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], at - corners[:, 0]
     a, b, c = (first * first).sum(1), (first * second).sum(1), (second * second).sum(1)
     p, q = (first * offset).sum(1), (second * offset).sum(1)

@@ -204,8 +204,12 @@ def _followed_pressing(pairs: _Pairs, inertia: Tensor, there: Tensor, pull: Tens
     net = torch.zeros_like(there).index_add(0, rows, pushed.reshape(-1, 3))
     spread = (load.abs().unsqueeze(2).unsqueeze(3) * (normal.unsqueeze(2) * normal.unsqueeze(1)).unsqueeze(1)).reshape(-1, 3, 3)
     spread = there.new_zeros(len(there), 3, 3).index_add(0, rows, spread)
-    missing = (pairs.reach - ((pairs.weights.unsqueeze(2) * there[pairs.corners]).sum(dim=1) * normal).sum(dim=1)).clamp_min(0.0)
-    first = torch.arange(4, device=rows.device) < torch.where(pairs.edges, 2, 1).unsqueeze(1)  # (N, 4) corners of the first side
+    missing = (pairs.reach - ((pairs.weights.unsqueeze(2) * there[pairs.corners]).sum(dim=1) * normal).sum(dim=1)).clamp_min(
+        0.0
+    )
+    first = torch.arange(4, device=rows.device) < torch.where(pairs.edges, 2, 1).unsqueeze(
+        1
+    )  # (N, 4) corners of the first side
     outward = torch.where(first, 1.0, -1.0).unsqueeze(2) * normal.unsqueeze(1)  # (N, 4, 3)
     one = (net[pairs.corners] * outward).sum(dim=2)
     both = torch.einsum("nci,ncij,ncj->nc", outward, spread[pairs.corners], outward)

@@ -77,7 +77,8 @@ class Wind(Energy):
                 raise ValueError(f"wind: {name} is {value}; give a finite number >= 0")
         if not (math.isfinite(gust_time) and gust_time > 0):
             raise ValueError(f"wind: gust_time is {gust_time}; give seconds > 0")
-        self.x, self.y, self.z = (float(value) for value in velocity)
+        # A tensor stays one: steps are differentiated by it (hood.rollouts.differentiable).
+        self.x, self.y, self.z = (value if isinstance(value, Tensor) else float(value) for value in velocity)
         self.drag, self.friction, self.density = drag, friction, density
         self.gusts, self.gust_time, self.seed = gusts, gust_time, seed
         self._waves = _dryden(gusts, gust_time, seed) if gusts > 0 else None
@@ -91,7 +92,10 @@ class Wind(Energy):
         slip = next_pos[cloth.faces].mean(dim=1) - rows.target
         across = (slip * rows.normal).sum(dim=1)
         along = slip - across.unsqueeze(1) * rows.normal
-        energy = rows.across * across.abs() ** 3 + rows.along * (along * along).sum(dim=1) ** 1.5
+        square = (along * along).sum(dim=1)
+        slips = square > 0  # the second derivative of the power is not a number at 0
+        cubed = torch.where(slips, torch.where(slips, square, 1.0) ** 1.5, 0.0)
+        energy = rows.across * across.abs() ** 3 + rows.along * cubed
         return sum_per_scene(energy / 3.0, cloth.face_scene, cloth.num_scenes)
 
     def rows(self, problem: StepProblem) -> DragRows:
@@ -110,14 +114,14 @@ class Wind(Energy):
     def air(self, problem: StepProblem, place: Tensor) -> Tensor:
         """Velocity of the air [m/s] (F, 3) at places (F, 3) of the faces, at the end of the step."""
         # No tensor comes from the host: a step may be recorded.
-        mean = torch.stack([torch.full_like(place[:, 0], value) for value in (self.x, self.y, self.z)], dim=1)
-        speed = math.sqrt(self.x**2 + self.y**2 + self.z**2)
-        if self._waves is None or speed == 0.0:
+        mean = torch.stack([torch.zeros_like(place[:, 0]) + value for value in (self.x, self.y, self.z)], dim=1)
+        square = self.x**2 + self.y**2 + self.z**2
+        if self._waves is None or square == 0.0:
             return mean.expand_as(place)
         scene, step, origin = problem.cloth.face_scene, problem.step, problem.state.origin
         time = step.dt.new_zeros(len(step.dt)) if step.time is None else step.time
         # Seconds by which the air is there later than at the world's origin.
-        late = ((place + origin.to(place)[scene]) * mean).sum(dim=1) / speed**2
+        late = ((place + origin.to(place)[scene]) * mean).sum(dim=1) / square
         frequency, size, phase = (wave.to(place) for wave in self._waves)
         since = (time.to(place)[scene] - late).unsqueeze(1)
         gust = (size * torch.sin(frequency * since + phase)).sum(dim=1)

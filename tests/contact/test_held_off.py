@@ -15,9 +15,8 @@ from hood.contact.further import MOST, RISE
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.mesh.penetration.crossing import crossings
-from hood.rollouts.loop import _as_taken
 from hood.solver.newton import NewtonSettings, minimize
-from hood.steppers.newton import NewtonStepper
+from hood.steppers.newton import NewtonStepper, as_taken
 from hood.testing import grid, sphere
 
 F64 = torch.float64
@@ -96,7 +95,7 @@ def test_a_step_of_the_solver_leaves_no_triangles_in_the_skin() -> None:
     assert len(cut(problem, before)) > 0
     assert len(cut(problem, taken.next_pos)) == 0
     assert taken.held_off is not None
-    gradient, _ = potential.gradient(_as_taken(known, taken), taken.next_pos)
+    gradient, _ = potential.gradient(as_taken(known, taken), taken.next_pos)
     assert float(gradient.norm()) < 0.05 * float((9.81 * problem.cloth.mass).norm())
     hurried = NewtonStepper(potential, NewtonSettings(budget_ms=1e6)).predict(problem, None)
     assert hurried.held_off is None

@@ -5,8 +5,8 @@ fabric, rest shape, state at t, body, targets of pins, gravity, constants of the
 
     dx/dp = −H⁻¹ ∂²Φ/∂x∂p,  H = ∂²Φ/∂x²,
 
-and a loss L(x) is differentiated by one linear system: H λ = ∂L/∂x, ∂L/∂p = −λ · ∂²Φ/∂x∂p. H is the Hessian itself, by autograd,
-not the positive matrix that the solver takes its steps with; that one, with its indefinite part, is the preconditioner.
+and a loss L(x) is differentiated by one linear system: H λ = ∂L/∂x, ∂L/∂p = −λ · ∂²Φ/∂x∂p. H is the Hessian itself, by
+autograd; the matrix of the solver, which has the bending by Gauss-Newton, is the preconditioner.
 
 The minimum is the solver's, bit for bit. What is kept of a step are its state and its contacts; everything else is computed
 again backwards. Which points of the body are nearest, and which side of a fold counts, is constant in the derivative, as it is
@@ -16,26 +16,29 @@ in the step; where they are, and the lagged forces of friction, are not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
 from hood.contact.contact import moving_contacts
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
+from hood.scene.jumps import find_jumps
+from hood.scene.scene import Scene
 from hood.solver.derivatives.self_contact import grips_of, layers_of
 from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.iterate import fixed_positions
 from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
 from hood.solver.system.plan import ModelBuilder, plan_for
 from hood.steppers.newton import NewtonStepper, as_taken
-from hood.tensors.batch import made_of
+from hood.tensors.batch import made_of, to_device
 
 T = TypeVar("T")
 
@@ -50,8 +53,8 @@ def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
 
     Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
     and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
-    tensors, such as ``Friction(coefficient)``. A step that misses the minimum has the derivative of the minimum nearby, and
-    ``rg`` of the solver's target says how near; give 1e-6 or less.
+    tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
+    the minimum nearby.
 
     Raises:
         ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
@@ -66,7 +69,8 @@ def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
         >>> held = np.array([True, True, False, False])
         >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
         >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
-        >>> state = State(torch.as_tensor(pos), torch.zeros(4, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
+        >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
+        >>> state = State(torch.as_tensor(pos), still, origin)
         >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
         >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
         >>> after.pos[3, 1].backward()
@@ -81,18 +85,46 @@ def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
     solved = _Solved(stepper, problem, given)
     pos = _Minimum.apply(solved, *given)
     change = (pos - problem.state.pos) / problem.vertex_dt
-    # The velocity is the solver's to the last bit, its derivative that of the difference.
-    vel = change + (solved.vel - change).detach()
-    return State(pos, vel, problem.state.origin)
+    # The velocity is the solver's, its derivative that of the difference.
+    return State(pos, solved.vel + (change - change.detach()), problem.state.origin)
 
 
-def differentiable_rollout(stepper: NewtonStepper, problem: StepProblem, steps: Iterable[StepInput]) -> Iterator[State]:
-    """States after each of ``steps``, from the state of ``problem``, each differentiable by all that came before; see
-    :func:`differentiable_step`. Their frame is that of ``problem``."""
-    for step in steps:
-        state = differentiable_step(stepper, replace(problem, step=step))
-        problem = replace(problem, state=state)
+def differentiable_states(
+    stepper: NewtonStepper,
+    scene: Scene,
+    state: State,
+    num_steps: int,
+    cloth: Cloth | None = None,
+    gravity: Tensor | None = None,
+) -> Iterator[State]:
+    """States of the frames after ``state``, which is that of frame 0, each differentiable by all that came before; see
+    :func:`differentiable_step`. The origin of their frame stays where that of ``state`` is.
+
+    Args:
+        cloth: default the scene's; :func:`hood.cloth.cloth.with_values` of that with a fabric to differentiate by.
+        gravity: (3,) m/s²; default the stepper's.
+
+    Raises:
+        ValueError: an event cuts the cloth in these frames, or the body jumps.
+    """
+    cloth, state = _in_double(scene.cloth if cloth is None else cloth), _in_double(state)
+    gravity = (stepper.gravity if gravity is None else gravity).double()
+    jumps = find_jumps(scene.motion, 1.0 / scene.dt)
+    for frame in range(num_steps):
+        if scene.cloth_of_step(frame, 0) is not scene.cloth:
+            raise ValueError(f"differentiable: an event cuts the cloth in frame {frame}; leave it out, or ask for fewer frames")
+        if frame in jumps:
+            raise ValueError(f"differentiable: the body jumps in frame {frame}; ask for fewer frames")
+        step = scene.step_input(frame, state)
+        step = StepInput(*(_in_double(getattr(step, spec.name)) for spec in fields(step)))
+        state = differentiable_step(stepper, StepProblem(cloth, state, step, gravity=gravity))
         yield state
+
+
+def _in_double(item: Any) -> Any:
+    if item is None:
+        return None
+    return item.double() if isinstance(item, Tensor) else to_device(item, dtype=torch.float64)
 
 
 class _Solved:
@@ -147,7 +179,8 @@ class _Solved:
         return torch.autograd.grad(value, leaves, allow_unused=True)
 
     def _solve(self, hessian: Callable[[Tensor], Tensor], rhs: Tensor) -> Tensor:
-        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients, preconditioned by the solver's matrix."""
+        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with the solver's matrix
+        as preconditioner."""
         with torch.no_grad():
             problem, plan = self.taken, plan_for(self.taken)
             layers, grips = layers_of(self._plain, problem), grips_of(self._plain, problem)
@@ -169,7 +202,7 @@ class _Solved:
         found, met = _flexible(hessian, precondition, rhs)
         if not met:
             warnings.warn(
-                "differentiable step: the adjoint system was not solved to 1e-10: the step has not ended at a minimum, or a "
+                "differentiable step: the adjoint system was not solved to 1e-7: the step has not ended at a minimum, or a "
                 "contact sets in there; its derivative is less exact",
                 stacklevel=2,
             )
@@ -185,6 +218,7 @@ class _Minimum(torch.autograd.Function):
         return solved.pos.clone()
 
     @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         return (None, *ctx.solved.pull_back(grad))
 
@@ -194,6 +228,8 @@ def _flexible(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor]
     conjugate gradients", 2000), and whether it was met."""
     x, r = torch.zeros_like(rhs), rhs.clone()
     limit = _TOLERANCE * rhs.norm()
+    if not bool(torch.isfinite(limit)):
+        return torch.full_like(rhs, torch.nan), False
     p = q = None
     for _ in range(_MOST_PRODUCTS):
         if not r.norm() > limit:
@@ -220,7 +256,8 @@ def _with_contacts(potential: Potential, problem: StepProblem, taken: StepProble
     if internal is None:
         return problem
     pos = problem.state.pos
-    at = pos if pos.requires_grad else pos.detach().requires_grad_()
+    # Apart from the positions at t that the energies themselves know.
+    at = pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
     (slope,) = torch.autograd.grad(internal.total(problem, at).sum(), at, create_graph=True)
     return replace(problem, internal_force=-slope)
 
