@@ -1,7 +1,7 @@
 """Modules of more than 300 lines and functions of more than 60, each with its reason; test_rooms.py compares."""
 
 MODULES = {
-    "hood/api.py": "the Python interface: six functions whose docstrings are the reference",
+    "hood/api.py": "the Python interface: seven functions whose docstrings are the reference",
     "hood/app/batch/batch.py": "many motions in one command: their folders, what is finished there, the summary over all",
     "hood/app/batch/dress.py": "one command: its words, what it tells, its end, and the dry run",
     "hood/app/batch/engines.py": "four engines with one task, of which the pool of processes is a part",
@@ -18,6 +18,8 @@ MODULES = {
     "hood/assets/pattern/blocks.py": "the blocks of flat pattern making, which share their table and their outlines",
     "hood/assets/garment/garment_arrays.py": "every field of a garment file: read, checked and written",
     "hood/assets/motion/layouts/people.py": "who is in a motion file, in one table or an entry a frame",
+    "hood/contact/contact.py": "what a contact is, its two searches in two forms, and how its points move",
+    "hood/rollouts/differentiable.py": "one derivative: what it is by, the contacts and the system behind it",
     "hood/native/build.py": "one way to a compiled library: at hand, from a wheel, or made",
     "hood/assets/pattern/bottoms.py": "designs of one kind, each a draft of its panels",
     "hood/assets/pattern/fronts.py": "what opens in front: panels, collars and lapels drawn, then cut open once they are sewn",

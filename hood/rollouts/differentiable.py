@@ -32,15 +32,13 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
-from hood.solver.derivatives.self_contact import grips_of, layers_of
-from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.iterate import fixed_positions
 from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
-from hood.solver.system.plan import ModelBuilder, plan_for
+from hood.solver.system.plan import plan_for, quadratic_model
 from hood.steppers.newton import NewtonStepper, as_taken
 from hood.tensors.batch import made_of, to_device
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 #: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian; each is
 #: preconditioned by a system with the solver's matrix, solved to the second number.
@@ -183,9 +181,7 @@ class _Solved:
         as preconditioner."""
         with torch.no_grad():
             problem, plan = self.taken, plan_for(self.taken)
-            layers, grips = layers_of(self._plain, problem), grips_of(self._plain, problem)
-            build = ModelBuilder(StepTerms(self._plain, problem), plan, layers, grips)
-            model = build(self.pos, problem.acceleration(self.pos))
+            model = quadratic_model(self._plain, problem, plan, self.pos, problem.acceleration(self.pos))
         parts = model.triples + model.indefinite_part, model.triples
         exact, positive = (beside(product(plan.pattern, triples), model.layers) for triples in parts)
         inverse = by_blocks(diagonal_inverse(plan.pattern, model.triples))
@@ -291,7 +287,7 @@ def _collect(item: object, found: dict[int, Tensor]) -> None:
             _collect(getattr(item, spec.name), found)
 
 
-def _swapped(item: T, table: Mapping[int, Tensor]) -> T:
+def _swapped(item: _T, table: Mapping[int, Tensor]) -> _T:
     """``item`` with its tensors replaced by those of the table, by what they are; itself where none is."""
     if isinstance(item, Tensor):
         return table.get(id(item), item)  # type: ignore[return-value]

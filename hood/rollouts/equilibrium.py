@@ -19,8 +19,8 @@ from hood.mesh.parts import find_parts
 from hood.mesh.topology import connected_components
 from hood.scene.worn import name_worn_part, worn_vertices
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.retry import minimize_held_off
 from hood.solver.step_figures import NOT_FINITE
+from hood.steppers.newton import minimize_held_off
 from hood.tensors.batch import to_device
 from hood.tensors.dense import add_rows
 

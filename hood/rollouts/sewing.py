@@ -35,7 +35,7 @@ from hood.rollouts.sewn import Sewn, held_limbs, joints_of, judged, limbs_in
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.retry import minimize_held_off
+from hood.steppers.newton import minimize_held_off
 
 if TYPE_CHECKING:
     from hood.assets.body.body import Body

@@ -11,9 +11,9 @@ from torch import Tensor
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.solver.newton import NewtonSettings, minimize
-from hood.solver.retry import minimize_held_off
 from hood.solver.step_figures import StepFigures, strain_metrics, vertex_residual
 from hood.steppers.network import Prediction
+from hood.steppers.newton import minimize_held_off
 
 #: A repaired step is kept if its strain p99 is higher by no more than this, or this share of it.
 _MORE_STRAIN, _SHARE_MORE = 0.02, 0.1

@@ -16,7 +16,7 @@ from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerGrips
 from hood.solver.derivatives import elements
-from hood.solver.derivatives.self_contact import LayerRows, layer_rows
+from hood.solver.derivatives.self_contact import LayerRows, grips_of, layer_rows, layers_of
 from hood.solver.derivatives.step_terms import PointBlocks, StepTerms, point_blocks
 from hood.solver.system.sparsity import BlockPattern, Scatter, axial_targets, matrix_targets, to_vertices, upper_pairs
 from hood.tensors.batch import made_of
@@ -199,7 +199,8 @@ def quadratic_model(potential: Potential, problem: StepProblem, plan: SolverPlan
     Matrix plus indefinite part is the Hessian, exact for inertia, contact, friction and membrane, Gauss-Newton for bending (see
     :mod:`hood.solver.derivatives.elements`). Terms of other classes enter the gradient, by autograd, but not the matrix.
     """
-    return ModelBuilder(StepTerms(potential, problem), plan)(pos, acc)
+    layers, grips = layers_of(potential, problem), grips_of(potential, problem)
+    return ModelBuilder(StepTerms(potential, problem), plan, layers, grips)(pos, acc)
 
 
 def _matrix_sum(pattern: BlockPattern, unknown: np.ndarray, elements: list[np.ndarray]) -> Scatter:

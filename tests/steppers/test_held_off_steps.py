@@ -14,7 +14,7 @@ from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.solver import retry
 from hood.solver.newton import NewtonSettings, Report, minimize
-from hood.solver.retry import minimize_held_off
+from hood.steppers.newton import minimize_held_off
 from hood.testing import grid, sphere
 
 F64 = torch.float64
