@@ -414,8 +414,8 @@ def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, pattern: Pattern, wher
         meet = {names[index] for index in of_panel[np.flatnonzero(row.reshape(-1) == bad[0]) // 3]}
         between = [str(k) for k, stitch in enumerate(pattern.stitches) if {stitch.first[0], stitch.second[0]} <= meet]
         raise ValueError(
-            f"{where}: more than two layers of cloth meet in one seam, of panels {', '.join(map(repr, sorted(meet)))}; remove one "
-            f"of stitches {', '.join(between)}; {LINING}"
+            f"{where}: more than two layers of cloth meet in one seam, of panels {', '.join(map(repr, sorted(meet)))}; "
+            f"remove one of stitches {', '.join(between)}; {LINING}"
         )
 
 
