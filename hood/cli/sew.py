@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig
+from scipy.spatial import cKDTree
 
 from hood.app.common import prepare_folder, require_package, split_words
 from hood.app.scene.fabrics import most_alike
@@ -39,6 +40,8 @@ UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
 #: Of ``waist``; what auto takes, how wide [m] its elastic is and how stiff in shear [N/m]: 3 cm stretch by 10% under 1.5 N.
 HELD, _DRAWN, _WAISTBAND, _SHEAR = "held", 0.85, 0.03, 169.0
+#: Folds this share of an edge apart have triangles of their own between them.
+_RESOLVED = 0.8
 #: How the word of an own design begins.
 _DESIGN = "design:"
 _WIDTH, _HEIGHT = 420, 560
@@ -69,7 +72,7 @@ def run(arguments: Sequence[str]) -> int:
     posed, sewn = sew_pattern(pattern, sheet, body, betas, material, angle)
     sheet, sewn = sewn_open(sheet, sewn, posed, material)
     worn = _garment(pattern, sheet, sewn)
-    print("\n".join(_report(pattern, sheet, sewn)))
+    print("\n".join([*_report(pattern, sheet, sewn), *near_folds(pattern, edge)]))
     if picture is not None:
         prepare_folder(picture.parent)
         save_png(picture, _sheet(worn, sheet, posed, most_alike(plain(config.material))))
@@ -187,6 +190,17 @@ def _report(pattern: Pattern, sheet: PatternSheet, sewn: Sewn) -> list[str]:
         count = int((sheet.made.elastic != 1.0).any(axis=1).sum())
         lines.append(f"elastic in {count} triangles; waist=held holds a waist instead")
     return lines
+
+
+def near_folds(pattern: Pattern, edge: float) -> list[str]:
+    """A line where folds of a panel are much nearer to each other than edges of the mesh are long [m]: pleats are strained."""
+    middles = [[0.5 * (fold.start + fold.end) for fold in panel.folds] for panel in pattern.panels.values()]
+    near = min((float(cKDTree(own).query(own, 2)[0][:, 1].min()) for own in middles if len(own) > 1), default=np.inf)
+    if near > _RESOLVED * edge:
+        return []
+    return [
+        f"folds {1e3 * near:.0f} mm apart are strained by edges of {1e3 * edge:g} mm; edge={max(near, _FINEST):.3f} resolves them"
+    ]
 
 
 def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody, fabric: str) -> np.ndarray:

@@ -248,6 +248,8 @@ def build_cloth(
     if made.bending is not None:
         real["bending_stiffness"] *= torch.as_tensor(made.factors(triangles, *hinge_table))
     weave = np.stack([fabric.on_faces(name) for name in WEAVE], axis=1)
+    if made.elastic is not None:  # threads of gathered cloth are not taut: the elastic is
+        weave[(made.elastic != 1.0).any(axis=1)] = 1.0
     if (weave != 1.0).any():
         grain = torch.as_tensor(grain_of(points, triangles, uv))
         real |= {"weave": torch.tensor(weave), "grain": grain, "rest_inverse": along_grain(real["rest_inverse"], grain)}

@@ -13,8 +13,10 @@ from sewing_patterns import skirt, write
 
 import hood
 from hood.assets.garment.garment import load_garment
-from hood.assets.pattern.designs import DESIGNS
+from hood.assets.pattern.designs import DESIGNS, draft
+from hood.assets.pattern.measures import measure_body
 from hood.cli.main import main
+from hood.cli.sew import near_folds
 from hood.mesh.flat import edge_lengths
 from hood.mesh.topology import unique_edges
 
@@ -142,3 +144,15 @@ def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None
     listed = re.search(r"NAME one of ([\w, ]+);", text)
     assert listed is not None
     assert re.findall(r"\w+", listed[1].replace(" or ", ", ")) == list(DESIGNS)
+
+
+def test_pleats_that_a_mesh_does_not_resolve_are_told() -> None:
+    """Flaps of box pleats are 22 mm wide in the middle of the skirt, those of knife pleats twice that."""
+    body = hood.load_body()
+    vertices, joints = body.shaped([0.0])
+    measures = measure_body(vertices, body.faces, joints)
+    box, knife = (draft("pleated", measures, {"pleat": pleat}) for pleat in ("box", "knife"))
+    assert near_folds(box, 0.035) == ["folds 22 mm apart are strained by edges of 35 mm; edge=0.022 resolves them"]
+    assert not near_folds(box, 0.02)
+    assert not near_folds(knife, 0.035)
+    assert not near_folds(draft("circle", measures), 0.1)

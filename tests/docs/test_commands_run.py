@@ -43,6 +43,7 @@ SHORT = (
     Short("^rollout(?!.*formats=).*texture=", ("formats=[glb]",), "an image is for pictures and exports; none are drawn"),
     Short("^rollout.*=dress_12k", ("garment=dress",), "another resolution of the same garment"),
     Short("^rollout.*=dress_4k", ("garment=dress",), "another resolution of the same garment"),
+    Short("^rollout.*=circle_4k", ("garment=circle",), "another resolution of the same garment"),
     Short("^dress", ("num_frames=2", "workers=1", "engine=local"), "one process here; engines have tests elsewhere"),
     Short("^dress(?!.*rows=)", ("garments=[tank]", "fabrics=[default]"), "two rows; their product has tests elsewhere"),
     Short("^sew", ("edge=0.05", "sheet=none"), "a coarse mesh; the sheet has a test of its own"),

@@ -8,9 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hood.assets.garment.garment import Garment
+from hood.assets.material import Material
+from hood.cloth.cloth import build_cloth
 from hood.media.colouring import colouring_of, skin_distance, vertex_strain
 from hood.media.film import Film
+from hood.mesh.flat import Construction
 from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.recorder import still_of
 from hood.testing import cylinder, sphere
 
 needs_pillow = pytest.mark.skipif(importlib.util.find_spec("PIL") is None, reason="needs Pillow")
@@ -38,6 +43,18 @@ def test_strain_of_vertices_is_the_largest_around_them(data: RolloutData) -> Non
     assert set(np.flatnonzero(vertex_strain(replace(data, cloth_pos=one))[0] > 1e-9)) >= {70, 69, 71}
     one[0, 70] = np.nan
     assert np.isnan(vertex_strain(replace(data, cloth_pos=one))[0, [69, 70]]).all()
+
+
+def test_strain_of_elastic_is_against_its_rest_not_its_cut() -> None:
+    """What a rollout's file keeps of elastic is the lengths of its edges."""
+    pos, faces = cylinder(12, 4, 0.1, 0.2)
+    made = Construction(elastic=np.full(faces.shape, 0.8))
+    garment = Garment("tube", pos, faces, np.zeros(len(pos), dtype=bool), elastic=made.elastic)
+    still = still_of(garment, cloth=build_cloth(pos, faces, Material(), made=made))
+    none = np.zeros((2, 0, 3)), np.empty((0, 3), dtype=np.int64)
+    data = RolloutData(np.stack([0.8 * pos, pos]), faces, pos, *none, np.arange(2) / 30, {}, {}, still=still)
+    np.testing.assert_allclose(vertex_strain(data)[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(vertex_strain(data)[1], 0.25, atol=1e-6)
 
 
 def test_a_range_for_all_frames(data: RolloutData) -> None:

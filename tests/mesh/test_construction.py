@@ -80,6 +80,17 @@ def test_elastic_weighs_what_it_is_cut_with_and_sizes_scale_it() -> None:
     assert torch.equal(taller.rest_angle.abs() == 0.5, folds)
 
 
+def test_threads_of_drawn_cloth_are_not_taut() -> None:
+    """Elastic resists as it is, whatever the threads around it do."""
+    garment, woven = _made(), Material(warp=100.0, weft=60.0, shear=0.5)
+    cloth = build_cloth(garment.rest_pos, garment.faces, woven, made=garment.construction)
+    drawn = (garment.elastic != 1.0).any(axis=1)  # type: ignore[union-attr]
+    assert cloth.weave is not None
+    assert 0 < int(drawn.sum()) < len(drawn)
+    assert set(map(tuple, cloth.weave[torch.as_tensor(drawn)].tolist())) == {(1.0, 1.0, 1.0)}
+    assert set(map(tuple, cloth.weave[torch.as_tensor(~drawn)].tolist())) == {(100.0, 60.0, 0.5)}
+
+
 def test_every_change_of_the_mesh_keeps_the_energy() -> None:
     garment = _made()
     pos = garment.rest_pos * [1.1, 0.9, 1.2] + 0.01 * np.random.default_rng(1).standard_normal(garment.rest_pos.shape)

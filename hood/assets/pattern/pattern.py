@@ -37,6 +37,10 @@ from hood.assets.pattern.riding import Patch, patches_of, written_patches
 MOST_GATHERED = 4.0
 #: Height [m] of the body that patterns are placed around that do not say.
 BODY_HEIGHT = 1.72
+#: What a seam of three layers is for, and how it is had.
+LINING = "a lining is a garment of its own, worn below, garment=[lining.npz,skirt.npz] of hood rollout"
+#: Drawings: DXF, also by the rules of AAMA and ASTM, and SVG.
+_DRAWINGS = (".dxf", ".svg")
 #: Points of a curve that measure its length and find where outlines cross.
 _POINTS = 33
 #: Edges shorter than this [m] are none. A pattern has units of at most so many metres.
@@ -174,6 +178,11 @@ def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:
     """
     path = Path(path)
     check_size(path, _SIZE_LIMIT)
+    if path.suffix.lower() in _DRAWINGS:
+        kind = path.suffix[1:].upper()
+        raise ValueError(
+            f"{path}: {kind} files draw outlines and do not say what is sewn to what; give a GarmentCode specification.json"
+        )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
@@ -327,7 +336,9 @@ def _check_stitches(where: str, pattern: Pattern, most: float) -> None:
             panel, there = pattern.panels[name], f"{where}: panel {name!r}, edge {pattern.panels[name].numbers[place]}"
             if (name, place) in taken:
                 other = taken[name, place]
-                raise ValueError(f"{there} is in stitches {other} and {number}; divide the edge, or remove one of them")
+                raise ValueError(
+                    f"{there} is in stitches {other} and {number}; divide the edge, or remove one of them; {LINING}"
+                )
             taken[name, place] = number
             lengths.append(panel.edges[place].length)
         if max(lengths) > most * min(lengths):

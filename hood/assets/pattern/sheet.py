@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
 from hood.assets.pattern.making import Fastener, construction_of, laid
-from hood.assets.pattern.pattern import BODY_HEIGHT, Pattern, PatternPanel
+from hood.assets.pattern.pattern import BODY_HEIGHT, LINING, Pattern, PatternPanel
 from hood.mesh import topology
 from hood.mesh.flat import Construction, in_triangles, inside
 
@@ -132,7 +132,7 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     middle = np.stack([np.bincount(welds, pos[:, axis]) for axis in range(3)], axis=1) / count[:, None]
     names, welded = list(pattern.panels), welds[corners]
     made = construction_of(pattern, corners, np.concatenate(tables), of_panel, outlines, creases)
-    _check_sheet(welded, of_panel, names, where)
+    _check_sheet(welded, of_panel, pattern, where)
     turned = _turned(welded, of_panel, len(names))
     welded[turned], corners[turned] = welded[turned][:, ::-1], corners[turned][:, ::-1]
     made = made.turned(turned)
@@ -400,8 +400,9 @@ def _dense(outline: np.ndarray, edge: float) -> np.ndarray:
     return np.asarray(((1.0 - share) * outline + share * following).reshape(-1, 2))
 
 
-def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, names: list[str], where: str) -> None:
+def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, pattern: Pattern, where: str) -> None:
     """Raise ValueError unless the welded faces are a sheet: three corners each, and two faces at most to an edge."""
+    names = list(pattern.panels)
     folded = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if folded.any():
         name = names[of_panel[int(folded.argmax())]]
@@ -410,9 +411,12 @@ def _check_sheet(faces: np.ndarray, of_panel: np.ndarray, names: list[str], wher
     _, row, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
     bad = np.flatnonzero(count > 2)
     if len(bad):
-        meet = np.unique(of_panel[np.flatnonzero(row.reshape(-1) == bad[0]) // 3])
-        found = ", ".join(repr(names[index]) for index in meet)
-        raise ValueError(f"{where}: more than two layers of cloth meet in one seam, of panels {found}; remove a stitch there")
+        meet = {names[index] for index in of_panel[np.flatnonzero(row.reshape(-1) == bad[0]) // 3]}
+        between = [str(k) for k, stitch in enumerate(pattern.stitches) if {stitch.first[0], stitch.second[0]} <= meet]
+        raise ValueError(
+            f"{where}: more than two layers of cloth meet in one seam, of panels {', '.join(map(repr, sorted(meet)))}; "
+            f"remove one of stitches {', '.join(between)}; {LINING}"
+        )
 
 
 def _turned(faces: np.ndarray, of_panel: np.ndarray, count: int) -> np.ndarray:

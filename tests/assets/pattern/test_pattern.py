@@ -165,6 +165,23 @@ def test_faults_are_named(message: str, tmp_path: Path) -> None:
         _sheet(tmp_path, _spoiled(_FAULTS[message]))
 
 
+def test_a_lining_in_the_seam_of_a_waistband_is_refused(tmp_path: Path) -> None:
+    """An edge has one stitch; what works is worn below."""
+    points = [[0, 0], [40, 0], [40, 30], [0, 30]]
+    panels = {"shell": panel(points), "lining": panel(points, None, (0, 0, -1)), "band": panel(points, None, (0, 30, 0))}
+    content = specification(panels, [("shell", 2, "band", 0), ("lining", 2, "band", 0)])
+    with pytest.raises(ValueError, match=r"panel 'band', edge 0 is in stitches 0 and 1; .* lining .* garment=\[lining\.npz"):
+        _sheet(tmp_path, content)
+
+
+@pytest.mark.parametrize("name", ["shirt.dxf", "shirt.SVG"])
+def test_drawings_are_refused_by_what_they_lack(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("0\nSECTION\n")
+    kind = name[-3:].upper()
+    with pytest.raises(ValueError, match=rf"shirt\.\w+: {kind} files draw outlines and do not say what is sewn to what; give"):
+        read_pattern(tmp_path / name)
+
+
 @pytest.mark.parametrize("text", ["", "[1]", '{"pattern": {}}', '{"pattern": {"panels": {"a": 3}}}'])
 def test_other_files_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text(text)
@@ -179,7 +196,8 @@ def test_three_layers_in_a_seam_are_refused(tmp_path: Path) -> None:
     closed = specification({"a": panel(points), "b": panel(points)}, [("a", k, "b", k) for k in range(4)])
     assert not topology.boundary_loops(_sheet(tmp_path, closed).faces)
     tube = specification({"a": panel(points), "b": panel(points)}, [("a", 0, "a", 2), ("a", 1, "b", 3)])
-    with pytest.raises(ValueError, match="more than two layers of cloth meet in one seam, of panels 'a'; remove"):
+    refusal = r"more than two layers of cloth meet in one seam, of panels 'a'; remove one of stitches 0; a lining is a garment"
+    with pytest.raises(ValueError, match=refusal):
         _sheet(tmp_path, tube, 0.15)
     with pytest.raises(ValueError, match="panel 'a' is sewn to itself over one edge; give a smaller edge="):
         _sheet(tmp_path, tube, 0.3)
