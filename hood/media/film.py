@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.formats.image import Texture
 from hood.media.colouring import colouring_of
-from hood.media.pieces import looks_of, pieces_of, thickness_of
+from hood.media.pieces import layer_distances, looks_of, pieces_of
 from hood.media.renderer.render import (
     BODY_COLOR,
     FAR,
@@ -98,10 +98,10 @@ class Film:
         self._floor = float(shown[..., 1].min())
         framed = _framed([data, *beside], self._path) if data.body_pos.shape[1] else shown - self._path[:, None]
         self._camera = Camera.framing(framed, azimuth_deg, 8.0, aspect=width / height, margin=_MARGIN)
-        self._thickness, self._shell = thickness_of(data), None
+        self._layers, self._shell = layer_distances(data), None
         away = float(np.linalg.norm(np.subtract(self._camera.position, self._camera.target)))
-        if self._thickness.max(initial=0.0) * self._camera.focal(SUPERSAMPLING * height) > away:
-            solid = (self._thickness[data.cloth_faces] == 0.0).all(axis=1)
+        if self._layers.sum(axis=1).max(initial=0.0) * self._camera.focal(SUPERSAMPLING * height) > away:
+            solid = (self._layers[data.cloth_faces] == 0.0).all(axis=(1, 2))
             self._shell = Extrusion(data.cloth_faces, data.cloth_pos.shape[1], kept=solid)
             self._prints = [one.on(self._shell) for one in self._prints]
 
@@ -133,7 +133,7 @@ class Film:
         if self.colouring is not None:
             colour = self.colouring.colours(index)
         if shell is not None:
-            pos, faces = shell.positions(pos, self._thickness), shell.faces
+            pos, faces = shell.positions(pos, self._layers), shell.faces
             colour, hem, shine = (values[shell.vertex] for values in (colour, hem, shine))
         return RenderMesh(pos, faces, colour, hem, 0.0, self._prints, shine)
 

@@ -115,12 +115,19 @@ def looks_of(data: RolloutData) -> tuple[list[FabricLook], np.ndarray]:
     return looks, number.reshape(-1)
 
 
-def thickness_of(data: RolloutData, thickness: float | None = None) -> np.ndarray:
-    """Thickness (V,) [m] of the cloth of a rollout: that of its fabrics, or the one given; 0 of what rides on it, which is
-    solid."""
+def layer_distances(data: RolloutData, thickness: float | None = None) -> np.ndarray:
+    """Distances (V, 2) [m] of the outer and the inner side of the cloth of a rollout from its mesh: half of the thickness of
+    its fabrics, or of the one given. The mesh of what rides on cloth, as a pocket, is its outer side; solid buttons have 0."""
     looks, number = looks_of(data)
-    found = np.array([look.thickness if thickness is None else thickness for look in looks])[number]
-    found[len(found) - data.riding[0] :] = 0.0
+    thick = np.array([look.thickness if thickness is None else thickness for look in looks])[number]
+    found = np.stack([0.5 * thick, 0.5 * thick], axis=1)
+    riders, num_faces = data.riding
+    if riders:
+        first = len(found) - riders
+        edges, count = topology.counted_edges(data.cloth_faces[len(data.cloth_faces) - num_faces :] - first)
+        part = topology.connected_components(riders, edges)
+        is_open = np.isin(part, part[edges[count == 1]])
+        found[first:] = np.stack([np.zeros(riders), is_open * thick[first:]], axis=1)
     return found
 
 

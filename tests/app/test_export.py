@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 import trimesh
 
 from hood.cli.main import main
+from hood.media.exports.sequences import clip_of
+from hood.media.pieces import layer_distances
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.file.recorder import RolloutWriter
 
@@ -197,7 +200,7 @@ def _glb_of(source: Path, target: Path, *words: str) -> tuple[dict, list[np.ndar
 
 
 def test_the_fabrics_say_how_thick_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two garments of two fabrics; and what rides on the cloth, here all of the second, stays as it is."""
+    """Two garments of two fabrics."""
     attributes = {"fabric_names": "wool_felt+silk"}
     still = {"fabric": np.repeat([0, 1], 4)}
     source = _rollout(tmp_path, attributes=attributes, still=still)
@@ -208,12 +211,30 @@ def test_the_fabrics_say_how_thick_they_are(tmp_path: Path, capsys: pytest.Captu
         pos = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
         assert _layers(pos) == pytest.approx(wanted, abs=2e-7)
         assert sum(line.startswith("vt ") for line in lines) == len(UV)
-    (tmp_path / "riding").mkdir()
-    ridden = _rollout(tmp_path / "riding", attributes={"riding_vertices": 4, "riding_faces": 2}, outfit=False)
-    assert main(["export", str(ridden), "format=ply", "thickness=auto", "num_frames=1", f"output={tmp_path / 'ply'}"]) == 0
-    mesh = trimesh.load(tmp_path / "ply" / "my_dress_obj_0001.ply", process=False, maintain_order=True)
-    assert len(mesh.vertices) == 4 + 4 + 4
+
+
+def test_the_mesh_of_what_rides_on_cloth_is_its_outer_side(tmp_path: Path) -> None:
+    """A pocket, here the upper square, is a shell below it; a solid button, closed as it is, stays."""
+    ridden = _rollout(tmp_path, attributes={"riding_vertices": 4, "riding_faces": 2}, outfit=False)
+    words = ["format=ply", "thickness=0.004", "num_frames=1", "parts=[cloth]"]
+    assert main(["export", str(ridden), *words, f"output={tmp_path / 'pocket'}"]) == 0
+    mesh = trimesh.load(tmp_path / "pocket" / "my_dress_obj_0001.ply", process=False, maintain_order=True)
+    assert mesh.is_watertight
+    assert len(mesh.vertices) == 2 * 8
     np.testing.assert_allclose(mesh.vertices[4:8], _cloth()[0, 4:], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[:8] - mesh.vertices[8:], axis=1), 0.004, atol=1e-6)
+    data = read_rollout(ridden)
+    ball = data.cloth_faces.max() + 1 + BODY.faces
+    data = replace(
+        data,
+        cloth_faces=np.concatenate([data.cloth_faces, ball]),
+        cloth_pos=np.concatenate([data.cloth_pos, data.body_pos], axis=1),
+        attributes={**data.attributes, "riding_vertices": 4 + len(BODY.vertices), "riding_faces": 2 + len(BODY.faces)},
+        still={},
+    )
+    both = clip_of(data, ["cloth"], layers=layer_distances(data, 0.004)).parts[0]
+    assert both.pos.shape[1] == 2 * 8 + len(BODY.vertices)
+    np.testing.assert_array_equal(both.pos[:, 8 : 8 + len(BODY.vertices)], data.body_pos)
 
 
 def test_only_what_is_asked_for(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd
 from hood.media.exports.sequences import PARTS, Clip, clip_of, write_obj_sequence, write_ply_sequence, write_point_cache
-from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name, thickness_of
+from hood.media.pieces import GarmentPiece, layer_distances, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.compact import STORES
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import still_of
@@ -121,17 +121,17 @@ def _export(
     replace: bool = False,
 ) -> str:
     """Write one format; what there is to say of it."""
-    thick = None if wanted.thickness == 0 else thickness_of(data, wanted.thickness)
+    layers = None if wanted.thickness == 0 else layer_distances(data, wanted.thickness)
     try:
-        clip = clip_of(data, wanted.parts, wanted.num_frames, wanted.up, lay_on(textures, [data])[0], thick)
+        clip = clip_of(data, wanted.parts, wanted.num_frames, wanted.up, lay_on(textures, [data])[0], layers)
         _write(target, form, clip, wanted.up, replace)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
     names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
     frames = f"{clip.num_frames} frames at {clip.fps:g} fps"
     text = f"{target}: {_megabytes(target):.1f} MB, {frames}, metres, {wanted.up} up: {names}"
-    if thick is not None:
-        text += f"\ncloth {_millimetres(thick)} thick, closed shells"
+    if layers is not None:
+        text += f"\ncloth {_millimetres(layers.sum(axis=1))} thick, closed shells"
     if clip.origin.any() and form in _FOLDERS:
         x, y, z = clip.origin.tolist()
         text += f"\nfar from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there"

@@ -162,7 +162,7 @@ class Extrusion:
     Example:
         >>> pos = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         >>> shell = Extrusion(np.array([[0, 1, 2]]), 3)
-        >>> len(shell.vertex), len(shell.faces), float(shell.positions(pos, 0.01)[3:, 2].max())
+        >>> len(shell.vertex), len(shell.faces), float(shell.positions(pos, np.full((3, 2), 0.005))[3:, 2].max())
         (6, 8, -0.005)
     """
 
@@ -187,9 +187,9 @@ class Extrusion:
         self.vertex = np.concatenate([self._sheet_vertex, self._sheet_vertex[self._twin]])
         self._sheet = point[corner]
 
-    def positions(self, pos: np.ndarray, thickness: float | np.ndarray) -> np.ndarray:
-        """Points (N, 3) [m] for vertices ``pos`` (V, 3): half the ``thickness`` [m], one or of every vertex (V,), to each side
-        along the mean normal of the faces around, weighted by their areas. Faces that are kept do not move."""
+    def positions(self, pos: np.ndarray, layers: np.ndarray) -> np.ndarray:
+        """Points (N, 3) [m] for vertices ``pos`` (V, 3): the outer and the inner layer are at distances ``layers`` (V, 2) [m]
+        from them, along the mean normal of the faces around, weighted by their areas. Faces that are kept do not move."""
         points = np.asarray(pos, dtype=np.float64)[self._sheet_vertex]
         a, b, c = (points[self._sheet[:, k]] for k in range(3))
         cross, normal = np.cross(b - a, c - a), np.zeros_like(points)
@@ -197,10 +197,9 @@ class Extrusion:
             share = np.repeat(cross[:, axis], 3)
             normal[:, axis] = np.bincount(self._sheet.reshape(-1), share, len(points))
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        half = np.broadcast_to(0.5 * np.asarray(thickness, dtype=np.float64), len(pos))[self._sheet_vertex]
-        shift = np.zeros_like(points)
-        shift[self._twin] = half[self._twin, None] * normal[self._twin]
-        return np.concatenate([points + shift, points[self._twin] - shift[self._twin]])
+        below = points[self._twin] - layers[self._sheet_vertex[self._twin], 1, None] * normal[self._twin]
+        points[self._twin] += layers[self._sheet_vertex[self._twin], 0, None] * normal[self._twin]
+        return np.concatenate([points, below])
 
 
 def _cut(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

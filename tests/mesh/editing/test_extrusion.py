@@ -13,7 +13,7 @@ THICK = 3e-3
 
 
 def _mesh(pos: np.ndarray, shell: Extrusion, thickness: float = THICK) -> trimesh.Trimesh:
-    return trimesh.Trimesh(shell.positions(pos, thickness), shell.faces, process=False)
+    return trimesh.Trimesh(shell.positions(pos, np.full((len(pos), 2), thickness / 2.0)), shell.faces, process=False)
 
 
 def _moebius(count: int = 24, width: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
@@ -74,8 +74,10 @@ def test_what_is_kept_does_not_move_and_has_no_second_layer() -> None:
     both, together = np.concatenate([pos, ball]), np.concatenate([faces, ball_faces + len(pos)])
     kept = np.arange(len(together)) >= len(faces)
     alone, shell = Extrusion(faces, len(pos)), Extrusion(together, len(both), kept)
-    points = shell.positions(both, np.full(len(both), THICK))
+    points = shell.positions(both, np.full((len(both), 2), THICK))
     np.testing.assert_array_equal(points[len(pos) : len(both)], ball)
     assert len(shell.faces) == len(alone.faces) + len(ball_faces)
     assert len(points) == len(both) + len(pos)
-    np.testing.assert_allclose(points[[*range(len(pos)), *range(len(both), len(points))]], alone.positions(pos, THICK))
+    np.testing.assert_allclose(
+        points[[*range(len(pos)), *range(len(both), len(points))]], alone.positions(pos, np.full((len(pos), 2), THICK))
+    )
