@@ -14,9 +14,13 @@ from scipy.spatial import cKDTree
 
 from hood.assets.formats.image import Texture
 from hood.media.colouring import colouring_of
-from hood.media.pieces import looks_of, pieces_of
+from hood.media.pieces import layer_distances, looks_of, pieces_of
 from hood.media.renderer.render import (
     BODY_COLOR,
+    FAR,
+    FUZZ,
+    SHEEN,
+    SUPERSAMPLING,
     Camera,
     Print,
     RenderMesh,
@@ -27,6 +31,7 @@ from hood.media.renderer.render import (
     render_frame,
 )
 from hood.media.video import VideoWriter, save_png
+from hood.mesh.editing.subdivision import Extrusion
 from hood.rollouts.file.reader import RolloutData
 
 _SHEET_FRAMES = 12
@@ -47,6 +52,8 @@ _SMOOTHING = 15  # frames over which the camera averages the walker's path
 
 class Film:
     """Draws frames of one rollout with one camera distance and angle; the camera follows the body, or the cloth without one.
+
+    Cloth that is thicker than what a drawn pixel spans is drawn as a closed shell: its thickness shows at hems.
 
     Args:
         data: the rollout.
@@ -78,7 +85,8 @@ class Film:
         self.colouring = colouring_of(data, colour, beside)
         looks, number = looks_of(data)
         self._own_colour = np.array([look.colour for look in looks])[number]
-        self._shine = np.array([(look.sheen, look.glint, look.fuzz) for look in looks])[number]
+        shine = [(SHEEN, 0.0, FUZZ) if self.colouring else (look.sheen, look.glint, look.fuzz) for look in looks]
+        self._shine = np.array(shine)[number]
         self._prints = () if self.colouring else _prints(data, textures or {})
         # Without a body the camera looks at the cloth, as far as that is finite.
         shown = data.body_pos
@@ -86,10 +94,16 @@ class Film:
             cloths = [data.cloth_pos, *(other.cloth_pos for other in beside)]
             shown = np.nan_to_num(np.concatenate(cloths, axis=1), posinf=0.0, neginf=0.0)
         self._path = _smooth_path(shown)
-        self._hem = None if self.colouring else hem_distance(data.rest_pos, data.cloth_faces)
+        self._hem = np.full(len(number), FAR) if self.colouring else hem_distance(data.rest_pos, data.cloth_faces)
         self._floor = float(shown[..., 1].min())
         framed = _framed([data, *beside], self._path) if data.body_pos.shape[1] else shown - self._path[:, None]
         self._camera = Camera.framing(framed, azimuth_deg, 8.0, aspect=width / height, margin=_MARGIN)
+        self._layers, self._shell = layer_distances(data), None
+        away = float(np.linalg.norm(np.subtract(self._camera.position, self._camera.target)))
+        if self._layers.sum(axis=1).max(initial=0.0) * self._camera.focal(SUPERSAMPLING * height) > away:
+            solid = (self._layers[data.cloth_faces] == 0.0).all(axis=(1, 2))
+            self._shell = Extrusion(data.cloth_faces, data.cloth_pos.shape[1], kept=solid)
+            self._prints = [one.on(self._shell) for one in self._prints]
 
     def frame(self, index: int) -> np.ndarray:
         """Picture (H, W, 3) uint8 of frame ``index``, with the bar of its colours."""
@@ -108,14 +122,20 @@ class Film:
             shown_body = _beneath(body, self.data.body_faces, cloth, self.thinner) if thin else body
             meshes.append(RenderMesh(shown_body, self.data.body_faces, BODY_COLOR, behind=_BEHIND))
         if dressed:
-            if self.colouring is None:
-                own = RenderMesh(cloth, self.data.cloth_faces, self._own_colour, self._hem, 0.0, self._prints, self._shine)
-            else:
-                own = RenderMesh(cloth, self.data.cloth_faces, self.colouring.colours(index), self._hem)
-            meshes.append(own)
+            meshes.append(self._drawn_cloth(index))
         picture = render_frame(meshes, camera, width=self.width, height=self.height, floor=self._floor)
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture
+
+    def _drawn_cloth(self, index: int) -> RenderMesh:
+        pos, faces, shell = self.data.cloth_pos[index], self.data.cloth_faces, self._shell
+        colour, hem, shine = self._own_colour, self._hem, self._shine
+        if self.colouring is not None:
+            colour = self.colouring.colours(index)
+        if shell is not None:
+            pos, faces = shell.positions(pos, self._layers), shell.faces
+            colour, hem, shine = (values[shell.vertex] for values in (colour, hem, shine))
+        return RenderMesh(pos, faces, colour, hem, 0.0, self._prints, shine)
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6, known: Mapping[int, np.ndarray] | None = None) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames; ``known`` are pictures that are there already, by their frames."""

@@ -42,7 +42,7 @@ struct Seen {
     const double* own;  // (height, width, 3) colours instead of those of vertices where not NaN; null: nowhere
     int64_t width, height, num_around;
     double eye[3];
-    double focal, reach, inside;  // pixels, m, share of the colour that an inside shows
+    double focal, reach;  // pixels, m
 };
 
 // As `FloorValues` of hood/media/renderer/raster.py: what lies behind the surface.
@@ -219,7 +219,7 @@ void shade(const Light& light, Vec pos, Vec normal, Vec view, Vec color, Vec shi
     }
 }
 
-// Colour of a pixel that sees a face; one seen from inside is darker.
+// Colour of a pixel that sees a face, from either side.
 void shade_pixel(const Light& light, const Seen& seen, const float* depths, int64_t row, int64_t column, double* out) {
     const int64_t pixel = row * seen.width + column;
     const int64_t* corner = seen.faces + 3 * (int64_t)seen.face[pixel];
@@ -242,10 +242,7 @@ void shade_pixel(const Light& light, const Seen& seen, const float* depths, int6
     }
     if (seen.own && !std::isnan(seen.own[3 * pixel])) color = at(seen.own, pixel);
     normal = unit(normal);
-    if (turned > 0) {
-        normal = -normal;
-        color = seen.inside * color;
-    }
+    if (turned > 0) normal = -normal;
     color = sewn(hem, 1.0 / (seen.focal * seen.nearness[pixel])) * color;
     shade(light, pos, normal, unit(at(seen.eye, 0) - pos), color, shines, openness(seen, depths, row, column, normal), out);
 }

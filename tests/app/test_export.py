@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 import trimesh
 
 from hood.cli.main import main
+from hood.media.exports.sequences import clip_of
+from hood.media.pieces import layer_distances
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.file.recorder import RolloutWriter
 
@@ -30,11 +33,18 @@ def _cloth(shift: float = 0.0) -> np.ndarray:
     return np.stack([rest + [0, 0.01 * t**2, 0] + 1e-3 * random.normal(size=rest.shape) for t in range(FRAMES)]) + [shift, 0, 0]
 
 
-def _rollout(folder: Path, shift: float = 0.0, outfit: bool = True, pos: np.ndarray | None = None) -> Path:
+def _rollout(
+    folder: Path,
+    shift: float = 0.0,
+    outfit: bool = True,
+    pos: np.ndarray | None = None,
+    attributes: dict | None = None,
+    still: dict | None = None,
+) -> Path:
     pos, path = _cloth(shift) if pos is None else pos, folder / "rollout.h5"
     body = np.stack([BODY.vertices + [shift, -0.5, 0.02 * t] for t in range(FRAMES)])
-    still = {"uv": UV, "uv_faces": UV_FACES, **({"piece": np.repeat([0, 1], 4)} if outfit else {})}
-    attributes = {"garment": "top+skirt" if outfit else "my dress.obj"}
+    still = {"uv": UV, "uv_faces": UV_FACES, **({"piece": np.repeat([0, 1], 4)} if outfit else {}), **(still or {})}
+    attributes = {"garment": "top+skirt" if outfit else "my dress.obj", **(attributes or {})}
     writer = RolloutWriter(
         path, FRAMES, pos[0], FACES, BODY.faces, len(BODY.vertices), ("rg",), DT, attributes, farthest=shift, still=still
     )
@@ -152,6 +162,81 @@ def test_sequences(tmp_path: Path, form: str) -> None:
         assert np.abs(corners - wanted[2][faces]).max() < 1e-6
 
 
+def _layers(pos: np.ndarray) -> float:
+    """How far the layers of a garment of four vertices are apart [m], nearly the same everywhere."""
+    apart = np.linalg.norm(pos[:4] - pos[4:8], axis=1)
+    assert np.ptp(apart) < 1e-6
+    return float(apart.mean())
+
+
+def test_cloth_with_a_thickness_is_closed_in_every_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of the outfit every garment by itself, with the UVs of the sheet on both sides and those of the rim on the strip."""
+    source, folder = _rollout(tmp_path), tmp_path / "ply"
+    assert main(["export", str(source), "format=ply", "thickness=0.003", f"output={folder}"]) == 0
+    assert "cloth 3 mm thick" in capsys.readouterr().out
+    for name, sheet in (("top", slice(0, 4)), ("skirt", slice(4, 8))):
+        for frame, wanted in enumerate(_cloth()[:, sheet]):
+            mesh = trimesh.load(folder / f"{name}_{frame + 1:04d}.ply", process=False, maintain_order=True)
+            assert mesh.is_watertight
+            assert abs(mesh.volume) == pytest.approx(0.003, rel=0.02)
+            assert _layers(mesh.vertices) == pytest.approx(0.003, abs=1e-6)
+            np.testing.assert_allclose((mesh.vertices[:4] + mesh.vertices[4:]) / 2.0, wanted, atol=1e-6)
+    document, arrays = _glb_of(source, tmp_path / "thick.glb", "thickness=0.003")
+    top = document["meshes"][0]["primitives"][0]
+    uv, faces = arrays[top["attributes"]["TEXCOORD_0"]] * [1, -1] + [0, 1], arrays[top["indices"]].reshape(-1, 3)
+    assert len(faces) == 2 + 2 + 2 * 4
+    assert np.allclose(uv[faces[:2]], UV[UV_FACES[:2]], atol=1e-6)
+    assert np.allclose(uv[faces[2:4]], UV[UV_FACES[:2, ::-1]], atol=1e-6)
+    rims = {tuple(np.round(row, 3)) for row in UV[UV_FACES[:2]].reshape(-1, 2)}
+    assert {tuple(np.round(row, 3)) for row in uv[faces[4:]].reshape(-1, 2)} <= rims
+    targets = [arrays[target["POSITION"]] for target in top["targets"]]
+    assert len(targets) == FRAMES - 1
+    assert {len(target) for target in targets} == {len(uv)}
+
+
+def _glb_of(source: Path, target: Path, *words: str) -> tuple[dict, list[np.ndarray]]:
+    assert main(["export", str(source), "format=glb", f"output={target}", *words]) == 0
+    return _glb(target)
+
+
+def test_the_fabrics_say_how_thick_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two garments of two fabrics."""
+    attributes = {"fabric_names": "wool_felt+silk"}
+    still = {"fabric": np.repeat([0, 1], 4)}
+    source = _rollout(tmp_path, attributes=attributes, still=still)
+    assert main(["export", str(source), "format=obj", "thickness=auto", "num_frames=1", f"output={tmp_path / 'both'}"]) == 0
+    assert "cloth 0.12 to 2 mm thick" in capsys.readouterr().out
+    for name, wanted in (("top", 2e-3), ("skirt", 1.2e-4)):
+        lines = (tmp_path / "both" / f"{name}_0001.obj").read_text().splitlines()
+        pos = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+        assert _layers(pos) == pytest.approx(wanted, abs=2e-7)
+        assert sum(line.startswith("vt ") for line in lines) == len(UV)
+
+
+def test_the_mesh_of_what_rides_on_cloth_is_its_outer_side(tmp_path: Path) -> None:
+    """A pocket, here the upper square, is a shell below it; a solid button, closed as it is, stays."""
+    ridden = _rollout(tmp_path, attributes={"riding_vertices": 4, "riding_faces": 2}, outfit=False)
+    words = ["format=ply", "thickness=0.004", "num_frames=1", "parts=[cloth]"]
+    assert main(["export", str(ridden), *words, f"output={tmp_path / 'pocket'}"]) == 0
+    mesh = trimesh.load(tmp_path / "pocket" / "my_dress_obj_0001.ply", process=False, maintain_order=True)
+    assert mesh.is_watertight
+    assert len(mesh.vertices) == 2 * 8
+    np.testing.assert_allclose(mesh.vertices[4:8], _cloth()[0, 4:], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[:8] - mesh.vertices[8:], axis=1), 0.004, atol=1e-6)
+    data = read_rollout(ridden)
+    ball = data.cloth_faces.max() + 1 + BODY.faces
+    data = replace(
+        data,
+        cloth_faces=np.concatenate([data.cloth_faces, ball]),
+        cloth_pos=np.concatenate([data.cloth_pos, data.body_pos], axis=1),
+        attributes={**data.attributes, "riding_vertices": 4 + len(BODY.vertices), "riding_faces": 2 + len(BODY.faces)},
+        still={},
+    )
+    both = clip_of(data, ["cloth"], layers=layer_distances(data, 0.004)).parts[0]
+    assert both.pos.shape[1] == 2 * 8 + len(BODY.vertices)
+    np.testing.assert_array_equal(both.pos[:, 8 : 8 + len(BODY.vertices)], data.body_pos)
+
+
 def test_only_what_is_asked_for(tmp_path: Path) -> None:
     assert main(["export", str(_rollout(tmp_path)), "format=ply", "parts=[body]", "num_frames=1"]) == 0
     assert [path.name for path in (tmp_path / "rollout_ply").iterdir()] == ["body_0001.ply"]
@@ -166,6 +251,10 @@ def test_only_what_is_asked_for(tmp_path: Path) -> None:
         (["format=glb", "output=a.usd"], "ends in .glb"),
         (["format=glb", "parts=[shoes]"], "[cloth,body]"),
         (["format=glb", "num_frames=0"], "at least 1"),
+        (["thickness=0"], "none, auto (what the fabrics have), or metres above 0"),
+        (["thickness=0.5"], "at most 0.02"),
+        (["thickness=thin"], "none, auto"),
+        (["thickness=auto", "parts=[body]"], "leave thickness= out"),
     ],
 )
 def test_refusals_name_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str) -> None:

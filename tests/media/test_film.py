@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import threading
 import time
 from dataclasses import replace
@@ -9,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hood.assets.formats.image import Texture
 from hood.media.film import Film, drawn
 from hood.rollouts.file.reader import RolloutData
-from hood.testing import cylinder, sphere
+from hood.testing import cylinder, grid, sphere
 
-pytest.importorskip("PIL")
+Image = pytest.importorskip("PIL.Image")
 
 
 def ball_in_a_tube() -> RolloutData:
@@ -95,3 +97,40 @@ def test_a_frame_that_cannot_be_drawn_ends_the_film(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("hood.media.film._processors", lambda: 2)
     with pytest.raises(IndexError):
         list(drawn(film, [0, 99]))
+
+
+def _napkin(fabric: str) -> RolloutData:
+    """5 cm of cloth, level."""
+    pos, faces = grid(5)
+    pos = 0.05 * pos
+    attributes = {"fabric_names": fabric}
+    uv = {"uv": pos[:, [0, 2]] / 0.05, "uv_faces": faces}
+    empty = np.empty((1, 0, 3)), np.empty((0, 3), dtype=np.int64)
+    return RolloutData(pos[None], faces, pos, *empty, np.zeros(1), {}, attributes, still=uv)
+
+
+@pytest.mark.parametrize("colour", ["none", "strain"])
+def test_the_thickness_of_cloth_shows_where_a_pixel_is_thinner(colour: str) -> None:
+    """The plate of 2 mm of felt takes more rows of the picture than silk of 0.12 mm, which is drawn as a sheet."""
+    films = {fabric: Film(_napkin(fabric), 160, 160, 0.0, colour) for fabric in ("silk", "wool_felt")}
+    assert films["silk"]._shell is None
+    empty = np.median(films["silk"].picture(0).astype(int), axis=(0, 1))
+    silk, felt = (
+        int((np.abs(films[fabric].picture(0)[:, 80].astype(int) - empty).sum(axis=1) > 90).sum())
+        for fabric in ("silk", "wool_felt")
+    )
+    camera = films["silk"]._camera
+    pixels = 2e-3 * camera.focal(160) / np.linalg.norm(np.subtract(camera.position, camera.target))
+    assert felt - silk == pytest.approx(pixels, abs=2)
+    assert pixels > 3
+
+
+def test_an_image_is_on_the_shell_as_well() -> None:
+    content = io.BytesIO()
+    Image.new("RGB", (4, 4), (250, 40, 30)).save(content, "PNG")
+    texture = Texture(content.getvalue(), "image/png", ".png")
+    red = []
+    for fabric in ("silk", "wool_felt"):
+        picture = Film(_napkin(fabric), 160, 160, 0.0, textures={"cloth": texture}).picture(0).astype(int)
+        red.append(int((picture[..., 0] > 2 * picture[..., 2]).sum()))
+    assert red[1] > 1.2 * red[0] > 500

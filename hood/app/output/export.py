@@ -11,12 +11,13 @@ import importlib.util
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from omegaconf import DictConfig
 
 from hood.app.common import frame_count, split_words
-from hood.app.settings.compose import ConfigError, plain, require_choice
+from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import unknown
@@ -25,7 +26,7 @@ from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd
 from hood.media.exports.sequences import PARTS, Clip, clip_of, write_obj_sequence, write_ply_sequence, write_point_cache
-from hood.media.pieces import GarmentPiece, pieces_by, pieces_of, plain_name
+from hood.media.pieces import GarmentPiece, layer_distances, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.compact import STORES
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import still_of
@@ -37,6 +38,8 @@ _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
     "ply": write_ply_sequence,
 }
 FORMATS = ("usd", "glb", *_FOLDERS)
+#: Cloth is no thicker [m].
+_THICKEST = 0.02
 #: Those that hold images.
 _TEXTURED = ("usd", "glb", "pc2", "obj")
 
@@ -48,15 +51,16 @@ def export(arguments: Sequence[str]) -> tuple[Path, list[str]]:
         raise ConfigError(f"number of rollouts given: {len(files)}; give one, hood export rollout.h5")
     source = Path(files[0]).expanduser()
     source = source / "rollout.h5" if source.is_dir() else source
-    count = frame_count(config)
-    form, up, parts = _checked(config)
+    form, wanted = _checked(config)
     textures = read_textures(config)
     _check_textured(textures, [form], "format", f"format={form}")
-    if textures and "cloth" not in parts:
-        raise ConfigError(f"texture: parts={parts} leaves the garments out; leave texture= out, or take parts=[cloth,body]")
+    for key, asked in (("texture", bool(textures)), ("thickness", wanted.thickness != 0)):
+        if asked and "cloth" not in wanted.parts:
+            left_out = f"parts={wanted.parts} leaves the garments out"
+            raise ConfigError(f"{key}: {left_out}; leave {key}= out, or take parts=[cloth,body]")
     target = _target(config, source, form)
     data = read_checked(source, "fabric")
-    said = [_export(source, data, target, form, textures, clip_arguments=(parts, count, up))]
+    said = [_export(source, data, target, form, textures, wanted)]
     if not bool(data.attributes.get("complete", True)):
         there = f"{len(data.time)} of {data.attributes.get('num_planned', '?')} frames are there"
         said.append(f"the rollout is not finished: {there}")
@@ -104,7 +108,7 @@ def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Tex
     if not forms:
         return []
     data = read_checked(source, "fabric")
-    return [_export(source, data, _beside(source, form), form, textures, (list(PARTS), None, "y"), True) for form in forms]
+    return [_export(source, data, _beside(source, form), form, textures, _Wanted(), True) for form in forms]
 
 
 def _export(
@@ -113,26 +117,44 @@ def _export(
     target: Path,
     form: str,
     textures: Mapping[str, Texture],
-    clip_arguments: tuple[list[str], int | None, str],
+    wanted: _Wanted,
     replace: bool = False,
 ) -> str:
     """Write one format; what there is to say of it."""
-    up = clip_arguments[2]
+    layers = None if wanted.thickness == 0 else layer_distances(data, wanted.thickness)
     try:
-        clip = clip_of(data, *clip_arguments, lay_on(textures, [data])[0])
-        _write(target, form, clip, up, replace)
+        clip = clip_of(data, wanted.parts, wanted.num_frames, wanted.up, lay_on(textures, [data])[0], layers)
+        _write(target, form, clip, wanted.up, replace)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
     names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
-    text = f"{target}: {_megabytes(target):.1f} MB, {clip.num_frames} frames at {clip.fps:g} fps, metres, {up} up: {names}"
+    frames = f"{clip.num_frames} frames at {clip.fps:g} fps"
+    text = f"{target}: {_megabytes(target):.1f} MB, {frames}, metres, {wanted.up} up: {names}"
+    if layers is not None:
+        text += f"\ncloth {_millimetres(layers.sum(axis=1))} thick, closed shells"
     if clip.origin.any() and form in _FOLDERS:
         x, y, z = clip.origin.tolist()
         text += f"\nfar from the origin: positions are from ({x:g}, {y:g}, {z:g}) m; move the objects there"
     return text
 
 
-def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
-    """Format, axis that points up, and parts."""
+class _Wanted(NamedTuple):
+    """What of a rollout is written, and how."""
+
+    parts: Sequence[str] = PARTS
+    num_frames: int | None = None
+    up: str = "y"
+    thickness: float | None = 0.0  # m of the cloth; None: that of its fabrics
+
+
+def _millimetres(thickness: np.ndarray) -> str:
+    """What of the cloth is not 0, in words."""
+    low, high = (1e3 * edge(thickness[thickness > 0], initial=initial) for edge, initial in ((np.min, np.inf), (np.max, 0.0)))
+    return f"{low:.3g} mm" if low == high else f"{low:.3g} to {high:.3g} mm"
+
+
+def _checked(config: DictConfig) -> tuple[str, _Wanted]:
+    """Format, and what is written."""
     form, up = str(config.format), str(config.up)
     _check_format(form, "format", f"format={form}")
     require_choice(config, "up", ("y", "z"))
@@ -142,7 +164,20 @@ def _checked(config: DictConfig) -> tuple[str, str, list[str]]:
     parts = parts if isinstance(parts, list) else [parts]
     if not parts or any(part not in PARTS for part in parts):
         raise ConfigError(f"parts={plain(config.parts)}: give some of [cloth,body]")
-    return form, up, parts
+    return form, _Wanted(parts, frame_count(config), up, _thickness(config))
+
+
+def _thickness(config: DictConfig) -> float | None:
+    """Thickness [m] of the cloth in the file; None: that of its fabrics."""
+    value = config.thickness
+    if value in ("none", "auto"):
+        return 0.0 if value == "none" else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= _THICKEST:
+        raise ConfigError(
+            f"thickness={shown(value)}: give none, auto (what the fabrics have), or metres above 0, at most {_THICKEST:g}, "
+            "e.g. thickness=0.001"
+        )
+    return float(value)
 
 
 def _check_format(form: str, key: str, asked: str) -> None:

@@ -18,6 +18,7 @@ from hood.assets.formats.image import Texture
 from hood.assets.garment.garment import Garment
 from hood.media.pieces import looks_of, pieces_of
 from hood.media.renderer.render import BODY_COLOR
+from hood.mesh.editing.subdivision import Extrusion
 from hood.rollouts.file.reader import RolloutData
 
 
@@ -127,6 +128,7 @@ class ClipPart:
     uv_faces: np.ndarray | None = None  # (F, 3), into uv
     texture: Texture | None = None
     roughness: float = 0.9  # 0 to 1
+    layers: np.ndarray | None = None  # (V, 2) m, distances of both sides of the shell that it is to be; None: it stays a sheet
 
     def normals(self, frame: int) -> np.ndarray:
         """Unit normals (V, 3) of one frame; of vertices without a face, or with faces of no area, any."""
@@ -156,6 +158,7 @@ def clip_of(
     num_frames: int | None = None,
     up: str = "y",
     textures: Mapping[str, Texture] | None = None,
+    layers: np.ndarray | None = None,
 ) -> Clip:
     """A rollout as a clip: the cloth, one part a garment of an outfit, and the body.
 
@@ -164,6 +167,8 @@ def clip_of(
         num_frames: the first so many; None: all.
         up: ``y`` as in the rollout, or ``z``: turned by 90° about x.
         textures: images of garments that have texture coordinates, by the garment's name.
+        layers: of :func:`hood.media.pieces.layer_distances`: the cloth is closed shells
+            (:class:`hood.mesh.editing.subdivision.Extrusion`); None: sheets, with the rollout's vertices and faces.
 
     Raises:
         ValueError: nothing is left to export, or a position is not finite.
@@ -174,7 +179,7 @@ def clip_of(
         raise ValueError(f"dt is {dt} s; the file does not say how long a frame takes")
     meshes = []
     if "cloth" in parts:
-        meshes += _cloth(data, data.cloth_pos[:count], textures or {})
+        meshes += _cloth(data, data.cloth_pos[:count], textures or {}, layers)
     if "body" in parts and data.body_pos.shape[1]:
         meshes.append(ClipPart("body", data.body_pos[:count], data.body_faces, BODY_COLOR))
     if not meshes:
@@ -187,11 +192,11 @@ def clip_of(
     farthest = max(float(np.abs(mesh.pos).max(initial=0.0)) for mesh in meshes)
     origin = np.round(meshes[0].pos[0].astype(np.float64).mean(axis=0)) if farthest > _FAR else np.zeros(3)
     moved = (np.asarray(mesh.pos, np.float64) - origin for mesh in meshes)
-    turned = tuple(replace(mesh, pos=_upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))
-    return Clip(turned, 1.0 / dt, _upright(origin, up))
+    turned = (replace(mesh, pos=_upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))
+    return Clip(tuple(map(_shell, turned)), 1.0 / dt, _upright(origin, up))
 
 
-def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) -> list[ClipPart]:
+def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture], layers: np.ndarray | None) -> list[ClipPart]:
     """One part a garment where the file says which vertex belongs to which; it looks like the fabric of most of it."""
     found, (looks, look_of) = [], looks_of(data)
     for piece in pieces_of(data):
@@ -200,8 +205,19 @@ def _cloth(data: RolloutData, pos: np.ndarray, textures: Mapping[str, Texture]) 
         faces, texture = number[data.cloth_faces[piece.faces]], textures.get(piece.name)
         own = pos[:, piece.vertices]
         look = looks[int(np.bincount(look_of[piece.vertices], minlength=1).argmax())]
-        found.append(ClipPart(piece.name, own, faces, look.colour, piece.uv, piece.uv_faces, texture, look.roughness))
+        thick = None if layers is None else layers[piece.vertices]
+        found.append(ClipPart(piece.name, own, faces, look.colour, piece.uv, piece.uv_faces, texture, look.roughness, thick))
     return found
+
+
+def _shell(part: ClipPart) -> ClipPart:
+    """A sheet with its thickness; what is none as it is."""
+    if part.layers is None:
+        return part
+    shell = Extrusion(part.faces, part.pos.shape[1], kept=(part.layers[part.faces] == 0.0).all(axis=(1, 2)))
+    pos = np.stack([shell.positions(pos, part.layers) for pos in part.pos])
+    uv_faces = None if part.uv_faces is None else part.uv_faces.reshape(-1)[shell.source]
+    return replace(part, pos=pos, faces=shell.faces, uv_faces=uv_faces, layers=None)
 
 
 def _upright(pos: np.ndarray, up: str) -> np.ndarray:

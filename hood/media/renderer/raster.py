@@ -121,7 +121,7 @@ class SeenValues(ctypes.Structure):
         *fields("pos color normal shine screen depth hem faces face nearness around axes own", POINTER),
         *fields("width height num_around", COUNT),
         ("eye", _TRIPLE),
-        *fields("focal reach inside", REAL),
+        *fields("focal reach", REAL),
     ]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from hood.media.renderer.raster import (
     unit,
 )
 from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
+from hood.mesh.editing.subdivision import Extrusion
 from hood.mesh.topology import connected_components, counted_edges
 
 _Array = NDArray[np.float64]
@@ -111,6 +112,14 @@ class Print:
     faces: NDArray[np.int64]  # (N,) numbers of the faces
     corners: _Array  # (N, 3, 2) texture coordinates of their corners, v up; the image repeats beyond 0 and 1
 
+    def on(self, shell: Extrusion) -> Print:
+        """The image on the shell of the mesh."""
+        face, corner = np.divmod(shell.source, 3)
+        row = np.full(int(face.max(initial=-1)) + 1, -1)
+        row[self.faces] = np.arange(len(self.faces))
+        mine = np.flatnonzero(row[face[:, 0]] >= 0)
+        return replace(self, faces=mine, corners=self.corners[row[face[mine]], corner[mine]])
+
     def at(self, uv: _Array) -> _Array:
         """Colours (P, 3) at texture coordinates (P, 2), linear between pixels."""
         height, width = self.image.shape[:2]
@@ -160,9 +169,8 @@ GARMENT_COLOR = (0.20, 0.42, 0.66)
 #: Shares of the light in the broad highlight of a surface, and in what its fibres scatter where it is seen at a grazing angle.
 SHEEN, FUZZ = 0.06, 0.10
 
-_SUPERSAMPLING = 2
-#: Share of its colour that a face seen from inside shows.
-_INSIDE = 0.62
+#: Pixels are drawn in so many rows and columns.
+SUPERSAMPLING = 2
 #: A face whose normal has less than this [cosine] in common with the mean at a vertex is beyond a fold there.
 _CREASE = 0.5
 
@@ -171,8 +179,8 @@ _CREASE = 0.5
 class RenderMesh:
     """A surface to draw: `pos` (V, 3) [m], y up, `faces` (F, 3), `color` (3,) or per vertex (V, 3) in 0..1.
 
-    Both sides are drawn; the side that faces against its normal is darker. `hem` (V,) [m] is the distance from the next
-    hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
+    Both sides are drawn, in one colour: a collar and a lapel show their inner side. `hem` (V,) [m] is the distance from the
+    next hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
     the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces. `shine`, (3,) or
     per vertex (V, 3): shares of the light in a broad and in a narrow highlight, and in what fibres scatter.
     """
@@ -205,7 +213,7 @@ def render_frame(
     floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
     firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
     prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
-    view = _View.of(camera, surface, _SUPERSAMPLING * width, _SUPERSAMPLING * height)
+    view = _View.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
     lib = library()
     if lib is not None:
         dark, picture = dark_map(surface, floor_height), np.empty((height, width, 3), dtype=np.uint8)
@@ -213,10 +221,10 @@ def render_frame(
         seen, _alive = _seen_values(camera, surface, view, prints)
         lib.picture_draw(*(ctypes.byref(value) for value in (light.values(), seen, floor_there)), address(picture))
         return picture
-    image = backdrop(camera, light, surface, floor_height, width, height, _SUPERSAMPLING)
+    image = backdrop(camera, light, surface, floor_height, width, height, SUPERSAMPLING)
     _draw_surface(image, camera, light, surface, view, prints)
-    steps = range(_SUPERSAMPLING)
-    samples = [image[i::_SUPERSAMPLING, j::_SUPERSAMPLING] for i in steps for j in steps]
+    steps = range(SUPERSAMPLING)
+    samples = [image[i::SUPERSAMPLING, j::SUPERSAMPLING] for i in steps for j in steps]
     image = np.sum(samples, axis=0) / len(samples)
     return (255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2) + 0.5).astype(np.uint8)
 
@@ -351,10 +359,8 @@ def _draw_surface(
     to_eye = unit(np.asarray(camera.position) - pos)
     a, b, c = (view.screen[view.faces[:, k]] for k in range(3))
     turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    inside = turned[face]
-    normal[inside] *= -1.0
+    normal[turned[face]] *= -1.0
     foot = np.asarray(1.0 / (view.focal * view.buffer.nearness[row, column]), dtype=np.float64)
-    color = np.where(inside[:, None], _INSIDE * color, color)
     color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
     open_share = openness(view.buffer, view.focal, row, column, normal @ axes.T)
     shine = _blend(weights, surface.shine, corners)
@@ -378,7 +384,7 @@ def _seen_values(
     arrays += [packed(value) for value in (view.buffer.nearness, AROUND, camera.axes())] + ([] if own is None else [own])
     eye = tuple(float(value) for value in camera.position)
     addresses = [*(address(value) for value in arrays), *([None] if own is None else [])]
-    return SeenValues(*addresses, width, height, AROUND.shape[1], eye, view.focal, REACH, _INSIDE), arrays
+    return SeenValues(*addresses, width, height, AROUND.shape[1], eye, view.focal, REACH), arrays
 
 
 def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:

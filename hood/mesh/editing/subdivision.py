@@ -1,4 +1,7 @@
-"""Every triangle into four, by a smooth surface through the vertices: these stay where they are, new ones lie between them."""
+"""Every triangle into four, by a smooth surface through the vertices: these stay where they are, new ones lie between them.
+
+A sheet of triangles with its thickness: a closed shell of two layers, and a strip along open edges between them.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from hood.mesh.topology import edge_index, unique_edges
+from hood.mesh.topology import connected_components, edge_index, unique_edges
 
 #: A rim that turns by more than this [rad] at a vertex has a corner there, which stays sharp.
 _CORNER = np.radians(50.0)
@@ -137,3 +140,96 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     """Of length 1; zero where they have none."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+
+
+class Extrusion:
+    """The shell of a sheet, whatever its positions: numbers of its points and faces.
+
+    Where more than two faces meet in an edge, or two that are wound against each other, the sheet is cut: each of its parts
+    is closed by itself, and so is the whole.
+
+    Args:
+        faces: (F, 3) of the sheet.
+        num_vertices: of the sheet, V.
+        kept: (F,) bool, faces that stay as they are, as those of solid buttons.
+
+    Attributes:
+        vertex: (N,) vertex of the sheet that every point of the shell belongs to. The first V are these vertices, on the outer
+            layer, the side that normals point to.
+        faces: (G, 3) over points: the sheet's faces, in their order, then the inner layer and the strip.
+        source: (G, 3) the sheet's corner, three times its face and its place there, whose texture coordinate each corner has.
+
+    Example:
+        >>> pos = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        >>> shell = Extrusion(np.array([[0, 1, 2]]), 3)
+        >>> len(shell.vertex), len(shell.faces), float(shell.positions(pos, np.full((3, 2), 0.005))[3:, 2].max())
+        (6, 8, -0.005)
+    """
+
+    def __init__(self, faces: np.ndarray, num_vertices: int, kept: np.ndarray | None = None) -> None:
+        faces = np.asarray(faces, dtype=np.int64)
+        solid = np.zeros(len(faces), dtype=bool) if kept is None else kept
+        corner, point, rims, self._sheet_vertex = _cut(faces, num_vertices)
+        thick = corner[~solid]
+        start, end = rims[~solid[rims[:, 0] // 3]].T
+        strip = [np.stack(three, axis=1) for three in ((end, start, start), (end, start, end))]
+        self.source = np.concatenate([corner, thick[:, ::-1], *strip])
+        below = np.zeros(self.source.shape, dtype=bool)
+        below[len(corner) : len(corner) + len(thick)] = True
+        first = len(corner) + len(thick)
+        below[first : first + len(start), 2] = True
+        below[first + len(start) :, 1:] = True
+        self._twin = np.unique(point[thick])
+        number = np.zeros(len(self._sheet_vertex), dtype=np.int64)
+        number[self._twin] = len(self._sheet_vertex) + np.arange(len(self._twin))
+        outer = point[self.source]
+        self.faces = np.where(below, number[outer], outer)
+        self.vertex = np.concatenate([self._sheet_vertex, self._sheet_vertex[self._twin]])
+        self._sheet = point[corner]
+
+    def positions(self, pos: np.ndarray, layers: np.ndarray) -> np.ndarray:
+        """Points (N, 3) [m] for vertices ``pos`` (V, 3): the outer and the inner layer are at distances ``layers`` (V, 2) [m]
+        from them, along the mean normal of the faces around, weighted by their areas. Faces that are kept do not move."""
+        points = np.asarray(pos, dtype=np.float64)[self._sheet_vertex]
+        a, b, c = (points[self._sheet[:, k]] for k in range(3))
+        cross, normal = np.cross(b - a, c - a), np.zeros_like(points)
+        for axis in range(3):
+            share = np.repeat(cross[:, axis], 3)
+            normal[:, axis] = np.bincount(self._sheet.reshape(-1), share, len(points))
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        below = points[self._twin] - layers[self._sheet_vertex[self._twin], 1, None] * normal[self._twin]
+        points[self._twin] += layers[self._sheet_vertex[self._twin], 0, None] * normal[self._twin]
+        return np.concatenate([points, below])
+
+
+def _cut(faces: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers (F, 3) of the corners of faces, the point (3F,) that each is at where the sheet is cut, the corners (B, 2) at
+    the ends of open edges, as their face runs along them, and the vertex (P,) of every point, the first of each vertex
+    being its own."""
+    corner = np.arange(faces.size).reshape(-1, 3)
+    vertex = faces.reshape(-1)
+    start, end = corner.reshape(-1), np.roll(corner, -1, axis=1).reshape(-1)
+    low, high = np.minimum(vertex[start], vertex[end]), np.maximum(vertex[start], vertex[end])
+    forward = vertex[start] == low
+    # Along an edge the first face that runs up is joined with the first that runs down, the second with the second.
+    key = low * (int(vertex.max(initial=0)) + 1) + high
+    order = np.lexsort((start, forward, key))
+    runs = np.concatenate([[True], (key[order][1:] != key[order][:-1]) | (forward[order][1:] != forward[order][:-1])])
+    begin = np.flatnonzero(runs)
+    rank = np.empty(len(start), dtype=np.int64)
+    rank[order] = np.arange(len(start)) - begin[np.cumsum(runs) - 1]
+    order = np.lexsort((forward, rank, key))
+    same = np.flatnonzero((key[order][1:] == key[order][:-1]) & (rank[order][1:] == rank[order][:-1]))
+    one, other = order[same], order[same + 1]
+    pairs = np.concatenate([np.stack([start[one], end[other]], axis=1), np.stack([end[one], start[other]], axis=1)])
+    fan = connected_components(faces.size, pairs)
+    open_edge = np.ones(len(start), dtype=bool)
+    open_edge[np.concatenate([one, other])] = False
+    # Fans are numbered by their first corners: the first of a vertex takes its number, others come after all vertices.
+    of_fan = vertex[np.unique(fan, return_index=True)[1]]
+    firsts = np.unique(of_fan, return_index=True)[1]
+    number = np.full(len(of_fan), -1)
+    number[firsts] = of_fan[firsts]
+    further = np.flatnonzero(number < 0)
+    number[further] = num_vertices + np.arange(len(further))
+    return corner, number[fan], np.stack([start, end], axis=1)[open_edge], np.append(np.arange(num_vertices), of_fan[further])
