@@ -60,6 +60,14 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "jumpsuit": ("", "length:0.25", "knee:0.8,hem:1.3,ease:0.12", "sleeve:0.4,shape:v"),
     "poncho": ("", "length:0.35,shape:v", "sleeve:0.3,length:0.0"),
     "cape": ("", "circle:1.0,length:0.4"),
+    "blouse": ("", "collar:stand,front:zip", "ease:0.3,length:0.45,cuff:0.0", "front:closed,collar:none,sleeve:0.5"),
+    "bomber": ("", "front:closed,rib:0.85", "ease:0.4,length:0.2,front:buttons", "sleeve:0.5,wide:1.4"),
+    "gilet": ("", "front:buttons,tube:0.15", "front:closed,length:0.35,ease:0.4"),
+    "blazer": ("", "front:closed,length:0.5", "lapel:0.11,depth:0.6,ease:0.3", "fit:1.0,sleeve:0.7"),
+    "pleated": ("", "pleat:box", "pleats:24,under:0.95,length:0.35", "pleats:8,length:0.75"),
+    "wrap": ("", "overlap:0.3,length:0.35", "overlap:0.85,flare:0.8,length:0.85"),
+    "apron": ("", "straps:back", "bib:0.75,flare:0.5,length:0.75", "straps:back,bib:0.45,length:0.25"),
+    "jeans": ("", "knee:0.6,hem:1.5", "hem:0.7,turn:0.0,ease:0.02", "length:0.7,turn:0.08"),
 }
 #: Of the lengths at rest as a share, and of the grain in degrees.
 LENGTH, GRAIN = 1e-3, 1.0

@@ -32,16 +32,17 @@ from hood.media.renderer.render import contact_sheet
 from hood.media.video import save_png
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.frames import ridden_faces, ridden_rest
-from hood.rollouts.sewing import sew_pattern, sewn_open, waist_of
-from hood.rollouts.sewn import Sewn
+from hood.rollouts.sewing import sew_pattern, sewn_open
+from hood.rollouts.sewn import Sewn, strapless, waist_of
 
 #: Exit code of a garment that is not sewn well.
 UNSEWN = 3
 _FINEST, _COARSEST = 0.004, 0.1
-#: Of ``waist``; what auto takes, how wide [m] its elastic is and how stiff in shear [N/m]: 3 cm stretch by 10% under 1.5 N.
-HELD, _DRAWN, _WAISTBAND, _SHEAR = "held", 0.85, 0.03, 169.0
 #: Folds this share of an edge apart have triangles of their own between them.
 _RESOLVED = 0.8
+#: Of ``waist``; what auto takes, at the waist and of a top without straps, how wide [m] its elastic is and how stiff in shear
+#: [N/m]: 3 cm stretch by 10% under 1.5 N.
+HELD, _DRAWN, _AT_CHEST, _WAISTBAND, _SHEAR = "held", 0.85, 0.95, 0.03, 169.0
 #: How the word of an own design begins.
 _DESIGN = "design:"
 _WIDTH, _HEIGHT = 420, 560
@@ -62,8 +63,8 @@ def run(arguments: Sequence[str]) -> int:
     material: Material = build(config.material)
     pattern, body, betas = _pattern(word, config, gathers)
     target = _target(config, pattern)
-    picture, written, factor = _picture(config, target), _specification(config), _waist(config)
-    sheet = _with_waist(sheet_of(pattern, edge, word), factor, material)
+    picture, written, sheet = _picture(config, target), _specification(config), sheet_of(pattern, edge, word)
+    sheet = _with_waist(sheet, _waist(config, sheet), material)
     prepare_folder(target.parent)
     if written is not None:
         prepare_folder(written.parent)
@@ -122,10 +123,12 @@ def _number(config: DictConfig, key: str, low: float, high: float, other: str = 
     return float(value)
 
 
-def _waist(config: DictConfig) -> float | None:
+def _waist(config: DictConfig, sheet: PatternSheet) -> float | None:
     """How many times as long as it is cut the elastic of a waist is at rest; None: it is held."""
-    if str(config.waist) in (AUTO, HELD):
-        return _DRAWN if str(config.waist) == AUTO else None
+    if str(config.waist) == AUTO:
+        return _AT_CHEST if strapless(sheet) else _DRAWN
+    if str(config.waist) == HELD:
+        return None
     return _number(config, "waist", *ELASTIC, f", {AUTO} or {HELD}")
 
 

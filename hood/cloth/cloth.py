@@ -19,7 +19,7 @@ from hood.assets.material import WEAVE, Material
 from hood.cloth.fabric import FabricMap
 from hood.mesh import geometry, topology
 from hood.mesh.editing.quality import check_triangles
-from hood.mesh.flat import Construction, edge_lengths, laid_out, rest_angles, rest_of
+from hood.mesh.flat import Construction, edge_extents, edge_lengths, laid_out, rest_angles, rest_of
 from hood.tensors.batch import concatenate, indexes
 from hood.tensors.dense import add_rows
 
@@ -27,6 +27,8 @@ from hood.tensors.dense import add_rows
 _LEVEL = 0.1
 #: Texture triangles whose edges have a smaller sine between them have no directions.
 _FLAT = 1e-6
+#: Lengths of one edge within this share are equal.
+_EVEN = 1e-5
 
 
 def grain_of(pos: np.ndarray, faces: np.ndarray, uv: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
@@ -153,6 +155,27 @@ class Cloth:
             return edge_lengths(self.flat, self.faces, self.edges)
         start, end = self.edges.unbind(dim=1)
         return (self.rest_pos[end] - self.rest_pos[start]).norm(dim=1)
+
+    @cached_property
+    def rest_extents(self) -> tuple[Tensor, Tensor]:
+        """The least and the greatest length [m] (E,) that the faces at every edge have there at rest: gathered cloth and what
+        it is sewn to."""
+        return (self.rest_length,) * 2 if self.flat is None else edge_extents(self.flat, self.faces, self.edges)
+
+    @cached_property
+    def gathered_edges(self) -> Tensor:
+        """Rows (N,) of the edges whose faces disagree by more than rounding about their length at rest."""
+        least, most = self.rest_extents
+        return (most > (1.0 + _EVEN) * least).nonzero().squeeze(1)
+
+    def edge_strain(self, pos: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Relative length change (N,) of the edges, or those of ``rows`` (N,), at ``pos`` (V, 3) [m], signed: what is beyond
+        all lengths of gathered ones."""
+        own = slice(None) if rows is None else rows
+        start, end = self.edges[own].unbind(dim=1)
+        length = (pos[end] - pos[start]).norm(dim=1)
+        least, most = (side[own] for side in self.rest_extents)
+        return (length / most - 1.0).clamp_min(0.0) + (length / least - 1.0).clamp_max(0.0)
 
     @cached_property
     def mean_edge(self) -> float:

@@ -1,6 +1,7 @@
 """Rest shapes that are flat patterns: every face has its own place in the plane, and need not fit its neighbours there.
 
-Along a seam the two faces of an edge may disagree about its length (gathers); the edge then counts as long as their mean.
+Along a seam the two faces of an edge may disagree about its length (gathers); the edge then counts as long as their mean, and
+as stretched by what is beyond both.
 
 How cloth is made beyond its fabric and its lengths: elastic, folds, and the layers of seams and hems, as numbers of the sides
 of faces. Side k of a face is opposite to its corner k: it goes wherever its corner goes.

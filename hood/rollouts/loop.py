@@ -241,20 +241,28 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         NotWornError: nor can it be put on in the T-pose, or the way from there ends in numbers that are not finite.
         TangledError: garments of an outfit cannot be taken apart.
     """
+    state, told = _begun(stepper, scene, potential, relaxing_steps, frame)
+    if told:
+        warnings.warn(told, stacklevel=2)
+    return state
+
+
+def _begun(stepper: Stepper, scene: Scene, potential: Potential, relaxing_steps: int, frame: int) -> tuple[State, str]:
+    """:func:`start_state`, and in words what stretches its edges beyond :data:`_TORN`; "" where nothing does."""
     try:
         state = scene.start(frame, relaxed=False, thorough=True)
     except NotWornError as refusal:
-        return _led_in(stepper, scene, potential, relaxing_steps, frame, refusal)
+        return _led_in(stepper, scene, potential, relaxing_steps, frame, refusal), ""
     put_on = _longest(scene, state.pos)
     if has_layers(potential):
         state = _taken_apart(scene, state, frame)
-    stretched = _longest(scene, state.pos)
+    stretched, told = _longest(scene, state.pos), ""
     if stretched > _TORN:
         part = worst_part(scene, state.pos.double().cpu().numpy())
         starts = (
             f"garment {scene.garment.name!r}{f', {part},' if part else ''} starts with edges stretched by up to {stretched:.0%}"
         )
-        warnings.warn(f"{starts} {_why_stretched(scene, frame, put_on)}", stacklevel=2)
+        told = f"{starts} {_why_stretched(scene, frame, put_on)}"
     prepared = prepare_stepper(stepper, scene)
     velocity = scene.start_velocity(frame)
     if stepper.relaxing is Relaxing.RESTART and relaxing_steps > 0:
@@ -273,7 +281,7 @@ def start_state(stepper: Stepper, scene: Scene, potential: Potential, relaxing_s
         kept = lower and bool(torch.isfinite(pos).all()) and _longest(scene, pos) <= max(_STRETCH, _longest(scene, state.pos))
         if kept and not _passes(scene, frame, state, pos):
             state = State(pos, state.vel, state.origin)
-    return State(state.pos, velocity, state.origin)
+    return State(state.pos, velocity, state.origin), told
 
 
 def _passes(scene: Scene, frame: int, state: State, pos: Tensor) -> bool:
@@ -359,15 +367,17 @@ def rest_state(
     most_steps: int | None = None,
 ) -> tuple[State, Rest | None]:
     """Start at rest on the still body of ``frame``, moving with the skinned garment, and how it was found; that of
-    :func:`start_state`, None and a warning where nothing holds the garment. ``most_steps`` as in
-    :func:`hood.rollouts.equilibrium.find_equilibrium`."""
+    :func:`start_state`, None and a warning where nothing holds the garment. Edges that are stretched at first are told where
+    they still are at rest. ``most_steps`` as in :func:`hood.rollouts.equilibrium.find_equilibrium`."""
     falls = without_hold(scene)
     if falls is not None:
         warnings.warn(f"garment {scene.garment.name!r} is not settled, it falls from its start: {falls}", stacklevel=2)
         return start_state(stepper, scene, potential, relaxing_steps, frame), None
-    start = start_state(stepper, scene, potential, 0, frame)
+    start, told = _begun(stepper, scene, potential, 0, frame)
     closed = None if attachments is None else attachments(0)
     rest = find_equilibrium(scene, potential, start, frame, stepper.gravity, closed, most_steps)
+    if told and _longest(scene, rest.pos) > _TORN:
+        warnings.warn(told, stacklevel=2)
     return State(rest.pos, scene.start_velocity(frame), start.origin), rest
 
 

@@ -26,12 +26,12 @@ from hood.assets.pattern.fronts import opened
 from hood.assets.pattern.sheet import PatternSheet, carry_over, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.cloth.state import Attachments, Obstacle, State, StepInput
-from hood.energies.potential import default_potential
+from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.sewn import Sewn, held_limbs, joints_of, judged, limbs_in
+from hood.rollouts.sewn import Sewn, bones_of, floor_at, held_limbs, judged, limbs_in, strapless, waist_of
 from hood.scene.start import push_out_of_body
 from hood.scene.untangle import smooth_out
 from hood.solver.newton import NewtonSettings, minimize
@@ -64,27 +64,28 @@ _REST, _NEARLY = 1e-3, 5e-3
 _ROUGH, _FINE = NewtonSettings(target_rg=0.1, max_iterations=15), NewtonSettings(target_rg=1e-2)
 #: Cloth that still passes through the body at rest is held so far off [m], one after the other.
 _HELD_OFF = (3e-3, 4e-3, 6e-3)
+#: Friction while a top without straps is drawn together, which would slide off the chest.
+_GRIP = 0.5
+#: Friction at rest holds what slips by less than this [m/s].
+_SLIP = 2e-4
+#: What still does begins again with the body grown by the first of these shares where nothing passes through it, which grows by
+#: so much of what it does elsewhere.
+_SHRUNK, _AGAIN = (0.8, 0.6, 0.4, 0.3, 0.2, 0.1, 0.0), 0.5
 #: Cloth at rest that passes through itself is smoothed there once in so many steps.
 _PAUSE = 8
 #: The coarse mesh has about so many vertices, with edges from the second to the third [m].
 _COARSE, _LEAST_EDGE, _MOST_EDGE = 700, 0.022, 0.05
-#: A garment whose top is below this share of the height of the body that it was drawn for is held up by its waist.
-_WAIST = 0.72
 #: Arms of the poses of the T and the A, degrees below the former.
 _TPOSE, _APOSE = 0.0, 45.0
 #: Legs of a body that puts on trousers end so far apart, degrees each, or else the second: between thighs that touch there is
 #: no room for two seams.
 _APART = (5.0, 10.0)
-#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
-_BESIDE, _HIGH = 0.19, 0.9
 #: Cloth nearer to the floor than the first [m] meets it: panels that reach lower begin within the second, pressed together.
 _LOW, _PRESSED = 0.15, 0.06
 #: Panels begin no farther before and behind the body [m].
 _DEEPEST = 0.25
 #: Where more than so many triangles pass through the thin body, starts of these shares of the width are looked at.
 _TANGLED, _NARROW = 40, (0.85, 0.7)
-#: The floor reaches so far [m] from the middle, in squares of the second.
-_FLOOR, _SQUARE = 1.2, 0.1
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class SewingStart:
 
     def thin_body(self) -> np.ndarray:
         """(W, 3) m: the skin of the body at the beginning."""
-        bones = _bones(self.before)
+        bones = bones_of(self.before)
         return np.asarray(bones + self.thin * (self.before.surface - bones))
 
     def placed(self, sheet: PatternSheet) -> np.ndarray:
@@ -138,7 +139,7 @@ def sew_pattern(
     """
     began = time.perf_counter()
     coarse = _coarser(pattern, sheet, _COARSE)
-    arms = [angle] if angle is not None else [_APOSE, _TPOSE] if sleeved(pattern) else [_TPOSE, _APOSE]
+    arms = [angle] if angle is not None else [_APOSE, _TPOSE] if pattern.sleeved else [_TPOSE, _APOSE]
     first = sewing_starts(coarse, _standing(body, betas, arms[0], 0.0))[0]
     if _has_legs(coarse, first):
         ways = [replace(first, posed=_standing(body, betas, arms[0], apart)) for apart in _APART]
@@ -148,17 +149,37 @@ def sew_pattern(
     ways.append(replace(ways[0], growth=_SLOWER))
     tries = []
     for way in ways:
-        coarse = coarse if way is not ways[-1] else _coarser(pattern, sheet, _FINER)
-        rough = sewn = sew_around(coarse, way.posed, material, start=way)
-        if coarse is not sheet and rough.figures.in_place:
-            sewn = sewn_finer(coarse, rough, sheet, way, material)
-        tries.append((way, coarse, rough, sewn))
-        if not sewn.figures.faults:
+        mesh = coarse if way is not ways[-1] else _coarser(pattern, sheet, _FINER)
+        rough = sew_around(mesh, way.posed, material, start=way)
+        tries.append(_Attempt(way, mesh, rough, rough))
+        if rough.figures.in_place and not rough.figures.body_crossings:
+            tries[-1] = tries[-1].finer(sheet, material)
+        if tries[-1].mesh is sheet and not tries[-1].sewn.figures.faults:
             break
-    way, coarse, rough, sewn = min(tries, key=lambda one: one[3].figures.rank)
-    if coarse is not sheet and sewn is rough:
-        sewn = sewn_finer(coarse, rough, sheet, way, material)
-    return way.posed, replace(sewn, seconds=time.perf_counter() - began)
+    else:  # what a coarse mesh passes through a fine one may not
+        for number in sorted(range(len(tries)), key=lambda number: tries[number].rough.figures.rank):
+            if tries[number].rough.figures.in_place:
+                tries[number] = tries[number].finer(sheet, material)
+                if not tries[number].sewn.figures.faults:
+                    break
+    best = min(tries, key=lambda one: one.sewn.figures.rank).finer(sheet, material)
+    return best.start.posed, replace(best.sewn, seconds=time.perf_counter() - began)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A garment sewn as the mesh ``mesh``: as the coarse one that was tried, and as it was asked for where it got there."""
+
+    start: SewingStart
+    mesh: PatternSheet
+    rough: Sewn
+    sewn: Sewn
+
+    def finer(self, sheet: PatternSheet, material: Material) -> _Attempt:
+        """As the mesh that is asked for; itself where it is."""
+        if self.mesh is sheet:
+            return self
+        return replace(self, mesh=sheet, sewn=sewn_finer(self.mesh, self.rough, sheet, self.start, material))
 
 
 def _standing(body: Body, betas: np.ndarray, arms: float, legs: float) -> PosedBody:
@@ -193,19 +214,10 @@ def _coarser(pattern: Pattern, sheet: PatternSheet, count: int) -> PatternSheet:
         wide *= 0.8
 
 
-def sleeved(pattern: Pattern) -> bool:
-    """Whether a panel is one of a sleeve, by its label or its place."""
-    for panel in pattern.panels.values():
-        middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
-        if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
-            return True
-    return False
-
-
 def sewing_starts(sheet: PatternSheet, posed: PosedBody, girths: Sequence[float] = _GIRTHS) -> list[SewingStart]:
     """Places of the pattern before and behind a body with limbs in as many openings as can be had, that with the fewest
     triangles through the thin body first; and of its girths the greatest with which there are no more."""
-    surface, bones = posed.surface, _bones(posed)
+    surface, bones = posed.surface, bones_of(posed)
     higher = float(sheet.pos[:, 1].max()) * (float(np.ptp(surface[:, 1])) / sheet.height - 1.0)
 
     def placed(lifts: Sequence[float], narrow: float = 1.0) -> list[tuple[tuple[int, int], SewingStart]]:
@@ -289,83 +301,34 @@ def sewn_open(sheet: PatternSheet, sewn: Sewn, posed: PosedBody, material: Mater
     return cut, replace(ready, seconds=sewn.seconds + ready.seconds)
 
 
-def waist_of(sheet: PatternSheet) -> np.ndarray:
-    """(V,) bool: the upper rim of a garment for the lower body: edges that the pattern calls ``lower_interface``, else the
-    highest opening where all of the pattern is below the chest. None of other garments."""
-    held = np.zeros(len(sheet.pos), dtype=bool)
-    if sheet.pos[:, 1].max() > _WAIST * sheet.height:
-        return held
-    rims = boundary_loops(sheet.faces)
-    rim = np.zeros_like(held)
-    for loop in rims:
-        rim[loop] = True
-    named = sheet.edge_labels.get("lower_interface")
-    if named is not None and (named & rim).any():
-        return np.asarray(named & rim)
-    if rims:
-        held[max(rims, key=lambda loop: float(sheet.pos[loop, 1].mean()))] = True
-    return held
-
-
-def _bones(posed: PosedBody) -> np.ndarray:
-    """(W, 3) m: for every vertex of the skin the nearest points of the bones that it follows, in their mean by its weights."""
-    body, skin, joints = posed.body, posed.surface, joints_of(posed)
-    result = np.zeros_like(skin)
-    for joint in range(len(joints)):
-        rows = np.flatnonzero(body.weights[:, joint] > 0)
-        ends = [joints[child] for child, parent in enumerate(body.parents) if parent == joint] or [joints[joint]]
-        nearest, least = np.zeros((len(rows), 3)), np.full(len(rows), np.inf)
-        for end in ends:
-            bone = end - joints[joint]
-            share = np.clip((skin[rows] - joints[joint]) @ bone / max(float(bone @ bone), 1e-12), 0.0, 1.0)
-            there = joints[joint] + share[:, None] * bone
-            distance = np.linalg.norm(skin[rows] - there, axis=1)
-            nearer = distance < least
-            nearest[nearer], least[nearer] = there[nearer], distance[nearer]
-        result[rows] += body.weights[rows, joint, None] * nearest
-    return result
-
-
-def _floor(height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) [m] and faces (F, 3) of a floor, its normals upwards."""
-    ticks = np.arange(-_FLOOR, _FLOOR + 0.5 * _SQUARE, _SQUARE)
-    x, z = (grid.reshape(-1) for grid in np.meshgrid(ticks, ticks, indexing="ij"))
-    number = np.arange(len(x)).reshape(len(ticks), -1)
-    a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    return np.stack([x, np.full_like(x, height), z], axis=1), faces
-
-
 class _Work:
     """The cloth of a pattern and the body that it is sewn around."""
 
     def __init__(self, sheet: PatternSheet, start: SewingStart, material: Material, held: np.ndarray) -> None:
         self.began = time.perf_counter()
-        self.start, self.faces, self.flat, self.held = start, sheet.faces, sheet.flat, held
+        self.start, self.sheet, self.faces, self.held = start, sheet, sheet.faces, held
         self.begun, firm = start.placed(sheet), sheet.stiffness
         self.cloth = build_cloth(
-            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=self.flat, made=sheet.made
+            self.begun, sheet.faces, material, stiffness=firm, dtype=torch.float64, flat=sheet.flat, made=sheet.made
         )
         posed = start.posed
         skin, thin, faces = posed.surface, start.thin_body(), posed.faces
         floor = float(skin[:, 1].min())
         if float(sheet.pos[:, 1].min()) + start.lift < _LOW:
-            points, squares = _floor(floor)
+            points, squares = floor_at(floor)
             faces = np.concatenate([faces, squares + len(skin)])
             skin, thin = np.concatenate([skin, points]), np.concatenate([thin, points])
         self.skin, self.thin, self.body_faces = (torch.as_tensor(table) for table in (skin, thin, faces))
         pairs = torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *sheet.rows.values()]))
         room = torch.full((len(pairs),), ROOM, dtype=torch.float64)
-        self.closed, self.fastened = sheet.closed, Attachments(pairs, pairs[:, 0] >= 0, room) if len(pairs) else None
+        self.fastened = Attachments(pairs, pairs[:, 0] >= 0, room) if len(pairs) else None
         self.progress = ProgressLines("sewing")
         self._growth = start.growth / max(float((self.skin - self.thin).norm(dim=1).max()), 1e-9)
 
     def sewn(self, pos: Tensor, steps: int, speed: float) -> Sewn:
         """What has come of it."""
         start, at = self.start, pos.numpy()
-        figures = judged(
-            self.cloth, self.faces, start.posed, self.flat, at, self.begun, self.held, speed, start.before, self.closed
-        )
+        figures = judged(self.cloth, self.sheet, start.posed, at, self.begun, self.held, speed, start.before)
         return Sewn(at, self.held, start.lift, start.depth, figures, steps, time.perf_counter() - self.began)
 
     def body(self, share: float, later: float) -> Obstacle:
@@ -381,6 +344,11 @@ class _Work:
         problem = StepProblem(cloth, State(pos, torch.zeros_like(pos), pos.new_zeros(1, 3)), step)
         return problem if weight else replace(problem, gravity=pos.new_zeros(3))
 
+    @staticmethod
+    def _resting(distance: float = _HELD_OFF[0]) -> Potential:
+        """What cloth rests under, so far off the body [m]: its friction slips in a long step no farther than in a rollout's."""
+        return default_potential(collision_epsilon=distance, contact="strict", friction_slip_speed=_SLIP)
+
     def _smoothed(self, pos: Tensor, share: float = 1.0) -> Tensor:
         """The cloth smoothed where it passes through itself."""
         return smooth_out(self.cloth, self.faces, pos, self.body(share, share), 2e-3)
@@ -390,7 +358,7 @@ class _Work:
 
     def draw_together(self, pos: Tensor) -> tuple[Tensor, int]:
         """The seams closed without weight while the body grows; and the steps that it took."""
-        plain = default_potential(friction_coefficient=0.0)
+        plain = default_potential(friction_coefficient=_GRIP if strapless(self.sheet) else 0.0)
         potential, share, dt, grown = plain, 0.0, 1e-3, 0
         for count in range(1, _MOST_DRAWN + 1):
             closed = dt > _CLOSED
@@ -415,7 +383,7 @@ class _Work:
 
     def rest(self, pos: Tensor, dt: float) -> tuple[Tensor, int, float]:
         """The cloth at rest under its weight, the steps, and the speed [m/s] in the last; the first lasts ``dt`` [s]."""
-        plain, body, speed = default_potential(contact="strict"), self.body(1.0, 1.0), math.inf
+        plain, body, speed = self._resting(), self.body(1.0, 1.0), math.inf
         potential, settings = plain, _ROUGH
         for count in range(1, _MOST_RESTING + 1):
             if potential is plain:
@@ -435,7 +403,33 @@ class _Work:
                 break
             dt = min(max(dt * min(max(2.0 * _STRIDE / max(float(moved.max()), 1e-9), 0.5), 2.0), 1.0 / 240.0), _LONGEST)
         problem = potential.prepare(self._problem(pos, _LONGEST, body, True))
-        return self._out_of_skin(minimize_held_off(potential, problem, pos, _FINE).pos), count, speed
+        return self._regrown(self._out_of_skin(minimize_held_off(potential, problem, pos, _FINE).pos)), count, speed
+
+    def _through(self, pos: Tensor, share: float = 1.0) -> int:
+        """How many triangles pass through the body that has grown by a share."""
+        posed = self.start.posed
+        skin = self.body(share, share).pos[: len(posed.surface)]
+        return len(crossings(pos.numpy(), self.faces, skin.numpy(), posed.faces).pairs)
+
+    def _regrown(self, pos: Tensor) -> Tensor:
+        """The cloth after the body has shrunk until nothing passes through it and grown again slowly, as a hand that had grown
+        through a sleeve; as it was where that leaves no fewer triangles through the body."""
+        count, best = self._through(pos), pos
+        share = next((share for share in _SHRUNK if not self._through(pos, share)), None) if count else None
+        if share is None:
+            return pos
+        layers = {} if self._crosses(pos) else {"layers": LayerBarrier()}
+        potential = self._resting().with_terms(**layers)
+        while share < 1.0:
+            later = min(1.0, share + _AGAIN * self._growth)
+            pos, share = (
+                minimize(potential, self._problem(pos, 1.0 / 60.0, self.body(share, later), False), pos, _FINE)[0],
+                later,
+            )
+        for dt in (_DRAWN, _LONGEST):
+            pos = minimize(potential, self._problem(pos, dt, self.body(1.0, 1.0), True), pos, _FINE)[0]
+        pos = self._out_of_skin(pos)
+        return pos if self._through(pos) < count else best
 
     def _out_of_skin(self, pos: Tensor) -> Tensor:
         """The cloth held farther off the body where triangles still pass through each other."""
@@ -444,6 +438,6 @@ class _Work:
         for distance in _HELD_OFF:
             if not len(crossings(pos.numpy(), self.faces, posed.surface, posed.faces).pairs):
                 break
-            potential = default_potential(collision_epsilon=distance, contact="strict").with_terms(**layers)
+            potential = self._resting(distance).with_terms(**layers)
             pos = minimize(potential, self._problem(pos, _DRAWN, body, True), pos, _FINE)[0]
         return pos

@@ -65,8 +65,7 @@ def leave_by_centroids(cloth: Cloth, pos: Tensor, obstacle: Obstacle, clearance:
 def free_stretch(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative lengthening (E,) of the edges at ``pos`` (V, 3); zero where both ends are held: nothing can be done there."""
     start, end = cloth.edges.unbind(dim=1)
-    rest_length = cloth.rest_length
-    return ((pos[end] - pos[start]).norm(dim=1) / rest_length - 1.0) * (cloth.free[start] | cloth.free[end])
+    return cloth.edge_strain(pos) * (cloth.free[start] | cloth.free[end])
 
 
 def _project(cloth: Cloth, pos: Tensor, obstacle: Obstacle | None, clearance: float, iterations: int) -> Tensor:

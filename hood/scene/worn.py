@@ -197,5 +197,4 @@ _QUANTILE_LIMIT = 1 << 24
 
 
 def _strain(scene: Scene, pos: Tensor) -> Tensor:
-    start, end = scene.cloth.edges.unbind(dim=1)
-    return ((pos[end] - pos[start]).norm(dim=1) / scene.cloth.rest_length - 1.0).double()
+    return scene.cloth.edge_strain(pos).double()

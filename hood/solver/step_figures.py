@@ -59,16 +59,17 @@ def layer_metrics(problem: StepProblem, next_pos: Tensor) -> dict[str, float]:
 
 def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
     """Relative length change of every edge, (E,), signed."""
-    start, end = cloth.edges.unbind(dim=1)
-    return (pos[end] - pos[start]).norm(dim=1) / cloth.rest_length - 1.0
+    return cloth.edge_strain(pos)
 
 
 def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
     """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite, and
     without edges."""
-    strain = absolute_strain(cloth, pos)
+    strain, gathered = absolute_strain(cloth, pos), cloth.gathered_edges
     if strain is None:
-        strain = edge_strain(cloth, pos).abs().double().cpu().numpy()
+        strain = cloth.edge_strain(pos).abs().double().cpu().numpy()
+    elif len(gathered):
+        strain[gathered.numpy()] = cloth.edge_strain(pos, gathered).abs().double().numpy()
     if len(strain) == 0 or not np.isfinite(strain).all():
         return dict.fromkeys(STRAIN_METRICS, float("nan"))
     strain.sort()

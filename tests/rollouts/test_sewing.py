@@ -157,13 +157,22 @@ def _tube(middle: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np
     return pos, faces, np.pad(laid_out(torch.as_tensor(pos), torch.as_tensor(faces)).numpy(), ((0, 0), (1, 0), (0, 0)))
 
 
+def _cut(faces: np.ndarray, cut: np.ndarray) -> PatternSheet:
+    """A sheet of one panel, for what judges it."""
+    uv, all_of = cut.reshape(-1, 2), {"tube": np.ones(len(faces), dtype=bool)}
+    pos, none = np.zeros((int(faces.max()) + 1, 3)), np.zeros(0)
+    return PatternSheet(pos, faces, uv, np.arange(len(uv)).reshape(-1, 3), all_of, none, none.astype(bool), {})
+
+
 def test_cloth_between_two_lengths_is_not_stretched(body: Body) -> None:
     posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
     pos, faces, cut = _tube(np.array([0.0, 0.0, 3.0]), 0.12)
     made, none = Construction(elastic=np.full(faces.shape, 0.7)), np.zeros(len(pos), dtype=bool)
     cloth = build_cloth(pos, faces, Material(), dtype=torch.float64, flat=cut, made=made)
     for share, expected in ((1.0, 0.0), (0.8, 0.0), (1.2, 0.2), (0.63, 0.1)):  # of the lengths that are cut
-        assert judged(cloth, faces, posed, cut, share * pos, pos, none, 0.0).strain_p99 == pytest.approx(expected, abs=1e-9)
+        assert judged(cloth, _cut(faces, cut), posed, share * pos, pos, none, 0.0).strain_p99 == pytest.approx(
+            expected, abs=1e-9
+        )
 
 
 def test_a_hem_may_be_above_or_below_the_arms_that_it_was_made_around(body: Body) -> None:
@@ -172,8 +181,8 @@ def test_a_hem_may_be_above_or_below_the_arms_that_it_was_made_around(body: Body
     (wide, faces, cut), (close, _, _) = _tube(chest, 0.7), _tube(chest, 0.25)
     cloth, none = build_cloth(wide, faces, Material(), dtype=torch.float64, flat=cut), np.zeros(len(wide), dtype=bool)
     assert limbs_in(wide[:16], posed) == {"trunk", "left arm", "right arm"}
-    assert judged(cloth, faces, posed, cut, close, wide, none, 0.0).swapped == ()
-    assert judged(cloth, faces, posed, cut, wide, close, none, 0.0).swapped != ()
+    assert judged(cloth, _cut(faces, cut), posed, close, wide, none, 0.0).swapped == ()
+    assert judged(cloth, _cut(faces, cut), posed, wide, close, none, 0.0).swapped != ()
 
 
 def test_a_wide_shirt_begins_around_the_arms(tmp_path: Path, body: Body) -> None:
@@ -197,7 +206,7 @@ def test_openings_around_other_limbs_are_told(tmp_path: Path, body: Body) -> Non
     right = _tube(joint["left_knee"] * [-1.0, 1.0, 1.0], 0.12)[0]
     cloth = build_cloth(left, faces, Material(), dtype=torch.float64, flat=cut)
     none = np.zeros(len(left), dtype=bool)
-    assert judged(cloth, faces, posed, cut, left, left, none, 0.0).swapped == ()
-    told = judged(cloth, faces, posed, cut, left, right, none, 0.0)
+    assert judged(cloth, _cut(faces, cut), posed, left, left, none, 0.0).swapped == ()
+    told = judged(cloth, _cut(faces, cut), posed, left, right, none, 0.0)
     assert told.swapped == ("the left leg, not the right leg",) * 2
     assert told.faults == ["an opening holds the left leg, not the right leg; another the left leg, not the right leg"]

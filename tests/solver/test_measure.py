@@ -21,6 +21,19 @@ def test_uniform_stretch_is_the_strain_of_every_edge() -> None:
     assert float(edge_strain(CLOTH, 0.9 * CLOTH.rest_pos).max()) == pytest.approx(-0.1)
 
 
+def test_gathered_edges_are_strained_beyond_both_of_their_lengths() -> None:
+    """Two triangles that share the diagonal of a square, one cut twice as large."""
+    pos = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    flat = pos[faces, :2] * np.array([1.0, 2.0])[:, None, None]
+    cloth = build_cloth(pos, faces, Material(), dtype=torch.float64, flat=flat)
+    for size, diagonal in ((0.9, -0.1), (1.0, 0.0), (1.5, 0.0), (2.5, 0.25)):
+        strain = cloth.edge_strain(torch.as_tensor(size * pos))
+        assert strain[cloth.gathered_edges].tolist() == pytest.approx([diagonal])
+        known = strain_metrics(cloth, torch.as_tensor(size * pos))
+        assert known["strain_max"] == pytest.approx(float(strain.abs().max()))
+
+
 def test_quantiles_of_the_absolute_strain() -> None:
     pos = CLOTH.rest_pos * torch.tensor([0.7, 1.0, 1.0])
     strain = edge_strain(CLOTH, pos).abs().numpy()

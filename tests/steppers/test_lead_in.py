@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from hood.assets.motion.sequence_edit import blend_in
 from hood.cloth.state import State
 from hood.energies.potential import default_potential
 from hood.energies.self_contact import LayerBarrier
-from hood.rollouts.loop import simulate
+from hood.rollouts.equilibrium import Rest
+from hood.rollouts.loop import rest_state, simulate
 from hood.scene.scene import LEAD_IN, NotWornError, Scene, build_scene
 from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import Prediction
@@ -101,8 +103,18 @@ def test_edges_stretched_by_taking_cloth_apart_are_not_put_down_to_the_pose(
     potential = default_potential().with_terms(layers=LayerBarrier())
     piece = np.arange(tank_scene.cloth.num_vertices) % pieces
     scene = replace(tank_scene, garment=replace(tank_scene.garment, piece=piece))
+    taken = RefinedStepper(GuessStepper(potential), potential, Count(1))
     with pytest.warns(UserWarning, match=rf"stretched by up to \d+% since {why}"):
-        next(simulate(RefinedStepper(GuessStepper(potential), potential, Count(1)), scene, potential, 2, metrics="none"))
+        next(simulate(taken, scene, potential, 2, metrics="none"))
+
+    def found(scene: Scene, potential: object, start: State, *others: object) -> Rest:
+        return Rest(scene.start(0).pos if pieces == 2 else start.pos, start.pos, 1, 0.0, 0.0)
+
+    monkeypatch.setattr("hood.rollouts.loop.find_equilibrium", found)
+    with warnings.catch_warnings(record=True) as heard:  # what settles is told where it is stretched at rest as well
+        warnings.simplefilter("always")
+        rest_state(taken, scene, potential, 2)
+    assert sum("stretched by up to" in str(one.message) for one in heard) == (pieces == 1)
 
 
 def test_what_the_t_pose_does_not_help_is_refused(

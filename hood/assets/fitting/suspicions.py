@@ -32,6 +32,7 @@ class Openings(NamedTuple):
 
     num: int
     num_empty: int  # those with no part of the body in them
+    empty: tuple[np.ndarray, ...] = ()  # vertices (n,) around each of these
 
 
 def find_openings(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_faces: np.ndarray) -> Openings:
@@ -44,16 +45,18 @@ def find_openings(pos: np.ndarray, faces: np.ndarray, surface: np.ndarray, body_
     part = topology.connected_components(len(pos), topology.unique_edges(faces))
     count = np.bincount([part[loop[0]] for loop in loops], minlength=1) if loops else np.zeros(1, dtype=np.int64)
     loops = [loop for loop in loops if count[part[loop[0]]] > 1]
-    return Openings(len(loops), _num_empty([pos[loop] for loop in loops], surface, body_faces))
+    holds = _hold([pos[loop] for loop in loops], surface, body_faces)
+    empty = tuple(loop for loop, one in zip(loops, holds, strict=True) if not one)
+    return Openings(len(loops), len(empty), empty)
 
 
-def _num_empty(rims: list[np.ndarray], surface: np.ndarray, faces: np.ndarray) -> int:
+def _hold(rims: list[np.ndarray], surface: np.ndarray, faces: np.ndarray) -> list[bool]:
     if not rims:
-        return 0
+        return []
     spans = [rim.mean(axis=0) + _SHARES[:, None, None] * (rim - rim.mean(axis=0)) for rim in rims]
     inside = signed_distances(np.concatenate([span.reshape(-1, 3) for span in spans]), surface, faces) < 0
     starts = np.cumsum([0, *(len(_SHARES) * len(rim) for rim in rims[:-1])])
-    return int((~np.logical_or.reduceat(inside, starts)).sum())
+    return list(np.logical_or.reduceat(inside, starts).tolist())
 
 
 #: A garment in its place has at most this share of its vertices inside the body, none deeper than this [m]: where a limb or

@@ -41,6 +41,8 @@ BODY_HEIGHT = 1.72
 LINING = "a lining is a garment of its own, worn below, garment=[lining.npz,skirt.npz] of hood rollout"
 #: Drawings: DXF, also by the rules of AAMA and ASTM, and SVG.
 _DRAWINGS = (".dxf", ".svg")
+#: A panel whose middle is so far to the side [m] and so high [m] is one of a sleeve.
+_BESIDE, _HIGH = 0.19, 0.9
 #: Points of a curve that measure its length and find where outlines cross.
 _POINTS = 33
 #: Edges shorter than this [m] are none. A pattern has units of at most so many metres.
@@ -157,6 +159,21 @@ class Pattern:
     panels: Mapping[str, PatternPanel]
     stitches: tuple[Stitch, ...]
     height: float = BODY_HEIGHT
+
+    @property
+    def sleeved(self) -> bool:
+        """Whether a panel is one of a sleeve, by its label or its place."""
+        for panel in self.panels.values():
+            middle = panel.placed(np.array([edge.start for edge in panel.edges])).mean(axis=0)
+            if panel.label == "arm" or (abs(middle[0]) > _BESIDE and middle[1] > _HIGH):
+                return True
+        return False
+
+    def told(self, number: int) -> str:
+        """A stitch in words, with the numbers of the file."""
+        sides = (self.stitches[number].first, self.stitches[number].second)
+        edges = (f"{name!r} edge {self.panels[name].numbers[place]}" for name, place in sides)
+        return f"stitch {number} ({' and '.join(edges)})"
 
 
 def read_pattern(path: Path, most_gathered: float = MOST_GATHERED) -> Pattern:

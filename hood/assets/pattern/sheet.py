@@ -46,6 +46,7 @@ class PatternSheet:
         made: its elastic, its folds and how stiff its seams and hems are.
         stiffness: (V,) how many times as stiff as the fabric the cloth is; None: once.
         joins: (J, 2) points of ``uv`` that seams join.
+        seams: points (N,) of ``uv`` along every stitch, by its number and edges in words.
         fastened: seams that are to be opened: what closes them, and their points (N, 2) of ``uv``.
         rows: of an opened sheet, (P, 2) vertices by name that close it; ``rims`` (N, 2) are all that face each other there, and
             ``closed`` (G, 3) faces as if each of these were one.
@@ -63,6 +64,7 @@ class PatternSheet:
     made: Construction = Construction()
     stiffness: np.ndarray | None = None
     joins: np.ndarray = field(default_factory=lambda: _NONE)
+    seams: Mapping[str, np.ndarray] = field(default_factory=dict)
     fastened: tuple[tuple[Fastener, np.ndarray], ...] = ()
     rows: Mapping[str, np.ndarray] = field(default_factory=dict)
     rims: np.ndarray = field(default_factory=lambda: _NONE)
@@ -146,7 +148,8 @@ def sheet_of(pattern: Pattern, edge: float, where: str) -> PatternSheet:
     sewn = PatternSheet(
         middle, welded, np.concatenate(tables), corners, parts, np.concatenate(places), seam, marks, pattern.height, made
     )
-    return replace(sewn, joins=joins, fastened=fastened)
+    seams = {pattern.told(number): outlines[stitch.first] for number, stitch in enumerate(pattern.stitches)}
+    return replace(sewn, joins=joins, seams=seams, fastened=fastened)
 
 
 def _joined(

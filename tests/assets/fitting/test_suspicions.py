@@ -29,7 +29,7 @@ OPENINGS = {"tshirt": 4, "tank": 4, "longsleeve": 4, "shorts": 3, "trousers": 3,
 @pytest.mark.parametrize("name", OPENINGS)
 def test_nothing_is_said_of_the_default_garments(garments: dict[str, Garment], body: Body, name: str) -> None:
     garment = garments[name]
-    assert find_openings(garment.tpose(np.zeros(10)), garment.faces, body.v_template, body.faces) == (OPENINGS[name], 0)
+    assert find_openings(garment.tpose(np.zeros(10)), garment.faces, body.v_template, body.faces)[:2] == (OPENINGS[name], 0)
     assert suspect_seams(garment.rest_pos, garment.faces) == []
     assert suspect_kind(garment.tpose(np.zeros(10)), garment.faces, body.v_template) == []
     for motion in ("walk_proud", "stand_sway"):
