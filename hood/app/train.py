@@ -36,7 +36,7 @@ from hood.app.stepping.cautions import idle_in_training
 from hood.assets.body.load import load_body
 from hood.assets.files.library import locate, motion_split, unknown
 from hood.assets.files.said import ProgressLines
-from hood.assets.garment.garment import load_garment
+from hood.assets.garment.garment import Garment, garments_in, load_garment
 from hood.assets.material import Material
 from hood.assets.motion.load import load_sequence
 from hood.assets.motion.motion_files import MotionFiles, find_motions
@@ -140,8 +140,8 @@ def _check_values(config: DictConfig) -> None:
     require_choice(config, "data.unusable", ("refuse", "skip"))
     require_choice(config, "data.up", ("auto", *UP_AXES))
     check_rate(config, "data.fps")
-    if not len(config.data.garments):
-        raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress]")
+    if not len(config.data.garments) and config.data.patterns is None:
+        raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress], or data.patterns=FOLDER")
 
 
 def _in_folder(config: DictConfig, bar: TrainingBar, notes: list[str]) -> Trained:
@@ -209,7 +209,7 @@ def make_trainer(config: DictConfig) -> Trainer:
     sampler = _make_scenes(
         config,
         body=load_body(str(config.data.body)),
-        garments=[as_simulated(load_garment(str(name))) for name in config.data.garments],
+        garments=_read_garments(config),
         sequences=_open_motions(config, names, fps, settings.horizon.maximum + 3),
         **_sampling(config),
         device=str(config.device),
@@ -312,6 +312,14 @@ def _sampling(config: DictConfig) -> dict[str, Any]:
     return sampling
 
 
+def _read_garments(config: DictConfig) -> list[Garment]:
+    """Those of ``data.garments``, and behind them those of the folder ``data.patterns``."""
+    names, folder = [str(name) for name in config.data.garments], config.data.patterns
+    if folder is not None:
+        names += map(str, garments_in(Path(str(folder)).expanduser()))
+    return [as_simulated(load_garment(name)) for name in names]
+
+
 def _open_motions(config: DictConfig, names: list[str], fps: float, min_frames: int) -> MotionFiles:
     """The training motions, read when they are drawn."""
     reading = _reading(config)
@@ -339,7 +347,7 @@ def _make_watch(config: DictConfig, sampler: SceneSampler, potential: Potential,
     motions = [load_sequence(str(name), float(config.data.fps), **_reading(config)) for name in names]
     validation = Validation(
         sampler.body,
-        sampler.garments,
+        sampler.garments[: len(config.data.garments) or None],  # hundreds of patterns would take longer than the training
         motions,
         for_networks(potential),
         num_frames=int(config.data.validation_frames),

@@ -5,18 +5,22 @@ The checkpoint before the newest stays beside it: a file that a failing disk spo
 
 from __future__ import annotations
 
+import hashlib
 import io
+import itertools
 import os
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hood.assets.files.atomic import write_atomically
+from hood.assets.garment.garment import Garment
 from hood.steppers.checkpoint import read_header
 from hood.training.settings import TrainerSettings
 
@@ -150,6 +154,33 @@ def refuse_other(
             f"{path}: trained with {len(state['slots'])} running scenes, this run has {num_slots}; pass the "
             "same trainer.batch_size, trainer.max_vertices and data.garments to resume it"
         )
+
+
+def marks_of(garments: Sequence[Garment]) -> list[str]:
+    """Name and checksum of every garment, for a checkpoint: files may change between two parts of a run."""
+    marks = []
+    for garment in garments:
+        content = hashlib.sha256()
+        for array in (garment.rest_pos, garment.faces, garment.flat, garment.elastic):
+            content.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+        marks.append(f"{garment.name} ({content.hexdigest()[:12]})")
+    return marks
+
+
+def refuse_other_garments(path: Path, state: Mapping[str, Any], garments: Sequence[Garment]) -> None:
+    """Refuse the checkpoint of a run on other garments; older ones do not say on which.
+
+    Raises:
+        ValueError: with the first garment that is another.
+    """
+    here = marks_of(garments)
+    there = state.get("garments", here)
+    for one, other in itertools.zip_longest(there, here, fillvalue="none"):
+        if one != other:
+            raise ValueError(
+                f"{path}: trained on {len(there)} garments, this run has {len(here)}; the first that differs is {one} there, "
+                f"{other} here; give back the files of data.garments and data.patterns to resume it"
+            )
 
 
 def generator_states(device: torch.device) -> dict[str, Tensor]:

@@ -28,8 +28,10 @@ from hood.training.callbacks import Callback, Reporter, ValidationWatch
 from hood.training.checkpoint import (
     generator_states,
     load_last_good,
+    marks_of,
     previous,
     refuse_other,
+    refuse_other_garments,
     require_plain,
     save_checkpoint,
     set_aside,
@@ -305,6 +307,7 @@ class Trainer:
             "window": distributed.gather(self.reporter.window.state_dict()),
             "callbacks": self.reporter.callback_states(),
             "model": self.simulator.config,
+            "garments": marks_of(self.slots.sampler.garments),
         }
         require_plain("trainer.schedule", state["rates"])
         require_plain("callbacks", state["callbacks"])
@@ -325,6 +328,7 @@ class Trainer:
             say(f"hood: {note}", error=True)
             set_aside(path)
         refuse_other(path, state, self.simulator.config, self.seed, self.settings, self.slots.num_slots)
+        refuse_other_garments(path, state, self.slots.sampler.garments)
         self._restore(state)
         # A finished run is saved again: it may have been killed between its checkpoint and its weights.
         self._saved_at = self.iteration if note is None and self.iteration < self.settings.iterations else -1

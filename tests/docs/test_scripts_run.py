@@ -95,6 +95,7 @@ RUN = (
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
     Run(r"preconditioners\.py$", "--frames 7", r"tank +\d.*×", (r"$", " tank")),
     Run(r"preconditioners\.py dress", "", "", (r"dress.*", "tank --frames 7")),
+    Run(r"sew_variants\.py", "--count 1 --designs tank --edge 0.06", r"1 of 1 garments in"),
     Run(r"sewing\.py", "--designs skirt --first 1 --betas 0 --edge 0.06", r"all: 1 of 1 sewn well"),
     Run(r"solver\.py", "--sides 9 --frames 2", r"one local sweep, 81 vertices"),
     Run(

@@ -174,6 +174,28 @@ def save_garment(path: Path, garment: Garment) -> None:
     write_fields(path, {field.name: getattr(garment, field.name) for field in fields(garment)})
 
 
+def garments_in(folder: Path) -> list[Path]:
+    """Garment files ``.npz`` in a folder and below, sorted.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        ValueError: there are none, or there is a sewing pattern without its garment; says how to sew it.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; give one with garments that hood sew made")
+    found = sorted(path for path in folder.rglob("*.npz") if not path.name.startswith("."))
+    sewn = {path.stem for path in found}
+    for path in sorted(folder.rglob("*specification.json")):
+        name = path.parent.name if path.stem == "specification" else path.stem
+        if name not in sewn:
+            raise ValueError(f"{path}: not sewn yet; hood sew {path} output={folder / name}.npz sews it")
+    if not found:
+        raise ValueError(
+            f"{folder}: no garments (.npz) in it or below; hood sew design:tshirt output={folder / 'tshirt.npz'} makes one"
+        )
+    return found
+
+
 def locate_garment(name: str | Path) -> tuple[Path, str | None]:
     """File of a garment, and which of its entries is meant (``garments_dict.pkl:dress``, ``scene.obj:tank``)."""
     require_name("garments", name)
