@@ -56,6 +56,7 @@ MODULES = {
     "hood/rollouts/file/reader.py": "whole rollouts from files: our own, and those of the published code with the way back",
     "hood/rollouts/file/recorder.py": "the writer of `rollout.h5` and the layout that it shares with the reader",
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
+    "hood/rollouts/sewn.py": "one verdict: every way in which a sewn garment is not one, with its panel and its seam",
     "hood/rollouts/sewing.py": "one procedure: where a pattern begins, its seams closed, its rest, coarse and then fine",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",
     "hood/scene/body_motion/mesh_motion.py": "a moving mesh and the points that ride on it",

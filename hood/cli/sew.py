@@ -202,7 +202,8 @@ def near_folds(pattern: Pattern, edge: float) -> list[str]:
     if near > _RESOLVED * edge:
         return []
     return [
-        f"folds {1e3 * near:.0f} mm apart are strained by edges of {1e3 * edge:g} mm; edge={max(near, _FINEST):.3f} resolves them"
+        f"folds {1e3 * near:.0f} mm apart are strained by edges of {1e3 * edge:g} mm; "
+        f"edge={max(near, _FINEST):.3f} resolves them"
     ]
 
 
