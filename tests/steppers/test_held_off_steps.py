@@ -12,8 +12,8 @@ from hood.cloth.cloth import build_cloth, concatenate_cloths
 from hood.cloth.state import Obstacle, State, StepInput, concatenate_obstacles
 from hood.energies.potential import Potential, default_potential
 from hood.energies.problem import StepProblem
-from hood.solver import retry
 from hood.solver.newton import NewtonSettings, Report, minimize
+from hood.steppers import newton as stepping
 from hood.steppers.newton import minimize_held_off
 from hood.testing import grid, sphere
 
@@ -63,12 +63,12 @@ def test_the_minimum_with_the_fewest_triangles_in_the_skin_counts(monkeypatch: p
         found.append((first.pos + torch.tensor([0.0, -0.001, 0.0], dtype=F64) * len(found), report))
         return (found[-1][0], report) if len(found) == 1 else (pos, report)
 
-    monkeypatch.setattr(retry, "minimize", worse)
+    monkeypatch.setattr(stepping, "minimize", worse)
     monkeypatch.setattr(StepProblem, "with_held_off", lambda self, *_: replace(self, contact=first.problem.contact))
     kept = minimize_held_off(default_potential(), problem, pos, NewtonSettings(), report)
-    assert len(found) == retry.MOST_RAISED
+    assert len(found) == stepping.MOST_RAISED
     assert torch.equal(kept.pos, first.pos)
-    assert kept.iterations == retry.MOST_RAISED * report.iterations
+    assert kept.iterations == stepping.MOST_RAISED * report.iterations
 
 
 def test_what_misses_its_target_is_not_taken_and_tried_once_more() -> None:
@@ -76,7 +76,7 @@ def test_what_misses_its_target_is_not_taken_and_tried_once_more() -> None:
     pos, report = solved(problem)
     short = NewtonSettings(max_iterations=1, target_rg=1e-12)
     missed = minimize_held_off(default_potential(), problem, pos, short, report)
-    assert (missed.problem, missed.report, missed.iterations) == (problem, report, retry.MOST_MISSES)
+    assert (missed.problem, missed.report, missed.iterations) == (problem, report, stepping.MOST_MISSES)
     assert torch.equal(missed.pos, pos)
     start = problem.state.pos
     _, unsolved = minimize(default_potential(), problem, start, short)
