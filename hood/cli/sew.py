@@ -201,10 +201,8 @@ def near_folds(pattern: Pattern, edge: float) -> list[str]:
     near = min((float(cKDTree(own).query(own, 2)[0][:, 1].min()) for own in middles if len(own) > 1), default=np.inf)
     if near > _RESOLVED * edge:
         return []
-    return [
-        f"folds {1e3 * near:.0f} mm apart are strained by edges of {1e3 * edge:g} mm; "
-        f"edge={max(near, _FINEST):.3f} resolves them"
-    ]
+    finer = max(near, _FINEST)
+    return [f"folds {1e3 * near:.0f} mm apart are strained by edges of {1e3 * edge:g} mm; edge={finer:.3f} resolves them"]
 
 
 def _sheet(worn: Garment, sheet: PatternSheet, posed: PosedBody, fabric: str) -> np.ndarray:
