@@ -140,7 +140,10 @@ def _check_values(config: DictConfig) -> None:
     require_choice(config, "data.unusable", ("refuse", "skip"))
     require_choice(config, "data.up", ("auto", *UP_AXES))
     check_rate(config, "data.fps")
-    if not len(config.data.garments) and config.data.patterns is None:
+    patterns = config.data.patterns
+    if patterns is not None and not Path(str(patterns)).expanduser().is_dir():
+        raise ConfigError(f"data.patterns={shown(patterns)}: no such folder; give one with garments that hood sew made")
+    if not len(config.data.garments) and patterns is None:
         raise ConfigError("data.garments=[]: give at least one, such as data.garments=[dress], or data.patterns=FOLDER")
 
 

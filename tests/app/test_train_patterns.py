@@ -66,7 +66,7 @@ def test_what_is_sewn_trains_with_the_lengths_of_its_pattern(tmp_path: Path) -> 
     ("spoil", "told"),
     [
         (lambda folder: [path.unlink() for path in folder.rglob("*.npz")], r"sewn: no garments .*hood sew design:tshirt"),
-        (lambda folder: folder.rename(folder.with_name("gone")), r"sewn: no such folder"),
+        (lambda folder: folder.rename(folder.with_name("gone")), r"data\.patterns=.*sewn: no such folder"),
         (lambda folder: np.savez(folder / "walk.npz", poses=np.zeros((9, 156))), r"sewn/walk\.npz: .*rest_pos"),
         (
             lambda folder: (folder / "b" / "specification.json").touch(),

@@ -43,7 +43,8 @@ class Desk:
         self.go = go
         self.makers: list[tuple[str, Callable[[str, Sequence[str]], Path]]] = [
             (r"outputs/set", self.data_set),
-            (r"(outputs/(?!plan/|set$)\w+|(.*/)?rollout\.h5)", self.rollout),
+            (r"outputs/sewn", self.sewn),
+            (r"(outputs/(?!plan/|set$|sewn$|unseen$)\w+|(.*/)?rollout\.h5)", self.rollout),
             (r"walk\.pkl", self.published_rollout),
             (r"long\.h5", self.long_rollout),
             (r"outputs/plan/plan\.json", self.plan),
@@ -186,6 +187,9 @@ class Desk:
 
     def bound_shirt(self, name: str, words: Sequence[str]) -> Path:
         return self._once("bound", lambda folder: save_garment(folder / "shirt.npz", load_garment("tshirt"))) / "shirt.npz"
+
+    def sewn(self, name: str, words: Sequence[str]) -> Path:
+        return self._once("sewn", lambda folder: save_garment(folder / "tank.npz", load_garment("tank")))
 
     def coat(self, name: str, words: Sequence[str]) -> Path:
         return self._once("coat", _write_coat) / name
