@@ -147,8 +147,8 @@ def test_any_seam_is_closed_by_a_fastener_and_opened(tmp_path: Path, capsys: pyt
     events = [{"frame": 2, "open": "side_zip"}]
     frames = [frame.world_pos.numpy() for frame in hood.simulate(target, "walk_brisk", num_frames=8, events=events)]
     gaps = [np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1).max() for pos in frames]
-    assert gaps[1] < 7e-3
-    assert gaps[-1] > 1e-2
+    assert gaps[1] < 1.2e-2
+    assert gaps[-1] > 2.0 * gaps[1], gaps
 
 
 def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None:
