@@ -358,7 +358,7 @@ class _Work:
 
     def draw_together(self, pos: Tensor) -> tuple[Tensor, int]:
         """The seams closed without weight while the body grows; and the steps that it took."""
-        plain = default_potential(friction_coefficient=_GRIP if strapless(self.sheet) else 0.0)
+        plain = default_potential(friction_coefficient=_GRIP if strapless(self.sheet) else 0.0, contact="strict")
         potential, share, dt, grown = plain, 0.0, 1e-3, 0
         for count in range(1, _MOST_DRAWN + 1):
             closed = dt > _CLOSED

@@ -187,7 +187,7 @@ def judged(
     }
     places = {name: _place(sheet, pos, np.reshape(rows, -1)) for name, rows in where.items() if np.size(rows)}
     if len(through):
-        places["body_crossings"] = f" at the {_member(posed, through[:, 1])}{places['body_crossings']}"
+        places["body_crossings"] = f" near the {_joint(posed, through[:, 1])}{places['body_crossings']}"
     return SewnFigures(
         len(through),
         len(folded),
@@ -225,12 +225,10 @@ def _place(sheet: PatternSheet, pos: np.ndarray, rows: np.ndarray) -> str:
     return f", in panel {told}" + (f" near {min(far, key=far.__getitem__)}" if far else "")
 
 
-def _member(posed: PosedBody, faces: np.ndarray) -> str:
-    """What most of the faces (N,) of a body belong to, by name of the joint that they follow most."""
-    owner = int(np.bincount(posed.body.weights[posed.faces[faces]].sum(axis=1).argmax(axis=1)).argmax())
-    while owner >= len(JOINTS):  # fingers hang from the wrist
-        owner = posed.body.parents[owner]
-    return JOINTS[owner].replace("_", " ")
+def _joint(posed: PosedBody, faces: np.ndarray) -> str:
+    """The joint that most of the faces (N,) of a body are nearest to, by name."""
+    nearest = cKDTree(joints_of(posed)[: len(JOINTS)]).query(posed.surface[posed.faces[faces]].mean(axis=1))[1]
+    return JOINTS[int(np.bincount(nearest).argmax())].replace("_", " ")
 
 
 def _girths(

@@ -138,6 +138,21 @@ def test_a_zip_closes_a_front_and_is_opened(tmp_path: Path, capsys: pytest.Captu
     assert apart[1].max() > 1e-2
 
 
+@pytest.mark.usefixtures("compiled_layers")
+def test_any_seam_is_closed_by_a_fastener_and_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content, target = skirt(), tmp_path / "skirt.npz"
+    content["pattern"]["stitches"][0][1]["hood"] = {"fastener": "side_zip"}
+    words = [str(write(tmp_path / "skirt.json", content)), "edge=0.06", "sheet=none", f"output={target}"]
+    assert main(["sew", *words]) == 0
+    assert "side_zip: " in capsys.readouterr().out
+    pairs = (load_garment(target).fasteners or {})["side_zip"]
+    events = [{"frame": 2, "open": "side_zip"}]
+    frames = [frame.world_pos.numpy() for frame in hood.simulate(target, "walk_brisk", num_frames=8, events=events)]
+    gaps = [np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1).max() for pos in frames]
+    assert gaps[1] < 1.2e-2
+    assert gaps[-1] > 2.0 * gaps[1], gaps
+
+
 def test_the_help_names_every_design(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sew", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())

@@ -19,8 +19,8 @@ from hood.assets.pattern.sheet import PatternSheet, sheet_of
 from hood.cloth.cloth import build_cloth
 from hood.mesh.flat import Construction, laid_out
 from hood.mesh.topology import boundary_loops
-from hood.rollouts.sewing import sew_around, sew_pattern, sewing_starts, waist_of
-from hood.rollouts.sewn import Sewn, SewnFigures, joints_of, judged, limbs_in
+from hood.rollouts.sewing import sew_around, sew_pattern, sewing_starts
+from hood.rollouts.sewn import Sewn, SewnFigures, joints_of, judged, limbs_in, strapless, waist_of
 
 
 def _sewn(name: str, tmp_path: Path, body: Body, edge: float) -> tuple[PatternSheet, Sewn]:
@@ -57,6 +57,10 @@ def test_a_waist_is_held_where_there_is_one(tmp_path: Path) -> None:
         held[name] = sheet.pos[waist_of(sheet)][:, 1]
         unlabelled = replace(sheet, edge_labels={})
         assert np.array_equal(waist_of(sheet), waist_of(unlabelled))
+    bandeau = sheet_of(read_pattern(write(tmp_path / "bandeau.json", skirt(92, 92, 30, 128))), 0.05, "bandeau")
+    assert np.allclose(bandeau.pos[waist_of(bandeau)][:, 1], 1.28)
+    assert strapless(bandeau)
+    assert not strapless(sheet)
     assert len(held["tshirt"]) == len(held["bodice"]) == 0
     assert np.allclose(held["skirt"], 1.07)
     assert np.allclose(held["trousers"], 1.04)
@@ -64,6 +68,7 @@ def test_a_waist_is_held_where_there_is_one(tmp_path: Path) -> None:
 
 def test_every_fault_is_told() -> None:
     good = SewnFigures(0, 0, 0.1, 4, 0, 0.01, 1e-4)
+    slid = {"sunk": 0.9, "under": 0.05, "empty_openings": 1, "speed": 0.2}
     assert good.faults == []
     for change, words in (
         ({"body_crossings": 3}, "3 pairs of triangles pass through the body"),
@@ -77,6 +82,13 @@ def test_every_fault_is_told() -> None:
         ({"loose": 0.06}, "its waist stands off the body by 6 cm"),
         ({"under": 0.05}, "reaches 5 cm below the floor"),
         ({"swapped": ("the left leg, not the trunk",)}, "an opening holds the left leg, not the trunk"),
+        ({"places": {"self_crossings": ", in panel 'cuff'"}, "self_crossings": 2}, "each other, in panel 'cuff'"),
+        # What has slid down is told by its cause alone.
+        (
+            slid | {"girths": (0.99, 0.81)},
+            "slid down by 90 cm: its upper edge is 99 cm around at rest, the body there 81 cm; it is",
+        ),
+        (slid | {"girths": (0.75, 0.97)}, "it does not hold up, waist=held holds it"),
     ):
         (text,) = replace(good, **change).faults
         assert words in text
@@ -173,6 +185,21 @@ def test_cloth_between_two_lengths_is_not_stretched(body: Body) -> None:
         assert judged(cloth, _cut(faces, cut), posed, share * pos, pos, none, 0.0).strain_p99 == pytest.approx(
             expected, abs=1e-9
         )
+
+
+def test_panel_seam_limb_and_girths_of_a_fault(body: Body) -> None:
+    posed = posed_body(body, arms_down(0.0), 0, np.zeros(10))
+    joint = dict(zip(JOINTS, joints_of(posed), strict=False))
+    pos, faces, cut = _tube(joint["left_knee"], 0.05)
+    cloth = build_cloth(pos, faces, Material(), dtype=torch.float64, flat=cut)
+    sheet, none = replace(_cut(faces, cut), seams={"stitch 3": np.array([0, 1])}), np.zeros(len(pos), dtype=bool)
+    (text, *_) = judged(cloth, sheet, posed, pos, pos, none, 0.0).faults
+    assert text.endswith("pairs of triangles pass through the body near the left knee, in panel 'tube' near stitch 3")
+    waist = np.array([0.0, 1.0, 0.0]) + posed.surface[:, 1].min() * np.array([0.0, 1.0, 0.0])
+    wide = _tube(waist, 0.2)[0]
+    rim, girth = judged(cloth, sheet, posed, wide - [0.0, 0.5, 0.0], wide, none, 0.0).girths or (0.0, 0.0)
+    assert rim == pytest.approx(32 * 0.05 * np.sin(np.pi / 16))  # at rest
+    assert 0.7 < girth < 0.9
 
 
 def test_a_hem_may_be_above_or_below_the_arms_that_it_was_made_around(body: Body) -> None:

@@ -269,7 +269,7 @@ def _divisions(
 def _apart(shares: set[float], least: float) -> np.ndarray:
     """Shares of a side in their order, as one where they are nearer than ``least``: ends of folds on both sides of a stitch."""
     steps = np.unique(np.round(sorted(shares), 9))
-    group = np.cumsum(np.diff(steps, prepend=-1.0) > least)
+    group = np.cumsum(np.diff(steps, prepend=-np.inf) > min(least, 0.5))  # a side that is shorter than that has its two ends
     middle = np.bincount(group, steps)[1:] / np.bincount(group)[1:]
     middle[0], middle[-1] = 0.0, 1.0
     return np.asarray(middle)

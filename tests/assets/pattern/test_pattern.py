@@ -29,6 +29,13 @@ def _sheet(tmp_path: Path, content: dict[str, Any], edge: float = 0.04) -> Patte
     return sheet_of(read_pattern(path), edge, str(path))
 
 
+def test_a_side_that_is_much_shorter_than_the_edges_has_its_two_ends(tmp_path: Path) -> None:
+    corner = panel([[0, 0], [40, 0], [40, 39.7], [39.7, 40], [0, 40]])
+    sheet = _sheet(tmp_path, specification({"front": corner}, []), 0.05)
+    edges = topology.unique_edges(sheet.faces)
+    assert np.linalg.norm(sheet.pos[edges[:, 0]] - sheet.pos[edges[:, 1]], axis=1).min() == pytest.approx(0.003 * 2**0.5)
+
+
 @pytest.mark.parametrize("name", PATTERNS)
 def test_panels_weld_to_an_oriented_sheet_with_the_lengths_of_the_pattern(name: str, tmp_path: Path) -> None:
     content = PATTERNS[name]()
