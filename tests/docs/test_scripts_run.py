@@ -109,6 +109,7 @@ RUN = (
         r"newton",
         (r"surface\.py[\w ]*?(?= --|$)", "surface.py tank"),
     ),
+    Run(r"wrinkles\.py", "--frames 7 --most 1 --rates 3", r"wrinkles 3 +\d", (r"circle", "tank"), slow=True),
     Run(r"waves\.py", "--garments tshirt --states 1 --frames 4", r"tshirt", slow=True),
 )
 #: Lines that are not run, and why; what they call has tests elsewhere.
