@@ -9,9 +9,10 @@ import difflib
 import json
 import math
 import os
+import re
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -37,6 +38,8 @@ _WAY_OUT = {
 _READERS = {"garments": ("meshes",), "motions": ("motions",), "body": (), "file": ("meshes", "motions")}
 #: Files of markers, which are no skeleton yet.
 _MARKERS = (".c3d", ".trc")
+#: A name of a finer garment: that of the coarse one, and about how many vertices it has.
+_SIZED = re.compile(r"(.+)(_\d+k)")
 _FITTED = "fit SMPL to its markers (MoSh++, SOMA) and give the .npz that comes out"
 _BVH_BODY = (
     "retarget it to SMPL (AMASS .npz), or animate a character with it in Blender and export that as GLB: body={stem}.glb"
@@ -108,7 +111,7 @@ def locate(kind: str, name: str | Path, folders: bool = False) -> Path:
     if path.is_dir():
         raise FileNotFoundError(f"{path}: a folder; give the path of a {_LABEL[kind]} file in it")
     if path.suffix or len(path.parts) > 1:
-        raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {', '.join(names(kind)) or 'none'})")
+        raise FileNotFoundError(f"{path}: no such file (embedded {kind}: {_listed(names(kind))})")
     raise FileNotFoundError(unknown(_LABEL[kind], str(name), names(kind)) + "; or give the path of a file")
 
 
@@ -128,7 +131,14 @@ def unknown(what: str, given: str, known: Iterable[str], meant: str | None = Non
     known = list(known)
     near = meant or nearest(given, known)
     hint = f"did you mean {near!r}? " if near else ""
-    return f"unknown {what} {given!r}: {hint}known are {', '.join(known) or 'none'}"
+    return f"unknown {what} {given!r}: {hint}known are {_listed(known)}"
+
+
+def _listed(known: Sequence[str]) -> str:
+    """Names in a sentence; of those that are there at several sizes (``dress_4k``) the sizes once, behind all."""
+    sized = {name: match for name in known if (match := _SIZED.fullmatch(name)) and match[1] in known}
+    sizes = ", ".join(sorted({match[2] for match in sized.values()}, key=len))
+    return (", ".join(name for name in known if name not in sized) or "none") + (f", most also with {sizes}" if sized else "")
 
 
 def nearest(given: str, known: Iterable[str]) -> str | None:

@@ -58,6 +58,13 @@ def test_unknown_without_any_known() -> None:
     assert unknown("weights name", "quick", []) == "unknown weights name 'quick': known are none"
 
 
+def test_sizes_of_a_garment_are_named_once() -> None:
+    known = ["dress", "dress_12k", "dress_4k", "tank", "tank_4k", "two_4k"]
+    assert unknown("garment", "drss_4k", known) == (
+        "unknown garment 'drss_4k': did you mean 'dress_4k'? known are dress, tank, two_4k, most also with _4k, _12k"
+    )
+
+
 def test_split_names_exist_and_do_not_overlap() -> None:
     split = motion_split()
     assert set(split) == {"train", "validation"}
