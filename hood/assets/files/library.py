@@ -34,12 +34,12 @@ _WAY_OUT = {
     "body": "export the character with its animation as GLB (Blender imports and exports it) and pass body={stem}.glb",
     "file": "export a garment as OBJ, a character with its animation as GLB (Blender imports and exports both)",
 }
+#: A name of a finer garment: that of the coarse one, and about how many vertices it has.
+_SIZED = re.compile(r"(.+)(_\d+k)")
 #: Plugins' readers of the kind, see :mod:`hood.plugins`.
 _READERS = {"garments": ("meshes",), "motions": ("motions",), "body": (), "file": ("meshes", "motions")}
 #: Files of markers, which are no skeleton yet.
 _MARKERS = (".c3d", ".trc")
-#: A name of a finer garment: that of the coarse one, and about how many vertices it has.
-_SIZED = re.compile(r"(.+)(_\d+k)")
 _FITTED = "fit SMPL to its markers (MoSh++, SOMA) and give the .npz that comes out"
 _BVH_BODY = (
     "retarget it to SMPL (AMASS .npz), or animate a character with it in Blender and export that as GLB: body={stem}.glb"
