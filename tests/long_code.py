@@ -55,7 +55,7 @@ MODULES = {
     "hood/rollouts/file/recorder.py": "the writer of `rollout.h5` and the layout that it shares with the reader",
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
     "hood/rollouts/sewing.py": "one procedure: where a pattern begins, its seams closed, its rest, coarse and then fine",
-    "hood/rollouts/sewn.py": "what a sewn garment is judged by: lengths, limbs in openings, and the place of each fault in words",
+    "hood/rollouts/sewn.py": "what a sewn garment is judged by: lengths, limbs in openings, where each fault is",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",
     "hood/scene/body_motion/mesh_motion.py": "a moving mesh and the points that ride on it",
     "hood/scene/scene.py": "one scene: its start, what each step prescribes, and how it is built",
