@@ -58,7 +58,6 @@ MODULES = {
     "hood/rollouts/loop.py": "the time loop with its start and its lead-in, which is a rollout itself",
     "hood/rollouts/sewn.py": "one verdict: every way in which a sewn garment is not one, with its panel and its seam",
     "hood/rollouts/sewing.py": "one procedure: where a pattern begins, its seams closed, its rest, coarse and then fine",
-    "hood/rollouts/sewn.py": "what a sewn garment is judged by: lengths, limbs in openings, where each fault is",
     "hood/rollouts/verdict/surface.py": "what is cut, what is crossed, what a viewer sees of both: one pass over stored frames",
     "hood/scene/body_motion/mesh_motion.py": "a moving mesh and the points that ride on it",
     "hood/scene/scene.py": "one scene: its start, what each step prescribes, and how it is built",
