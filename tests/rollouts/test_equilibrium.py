@@ -28,7 +28,7 @@ from hood.rollouts.frame import SETTLE_CHOICES, SETTLE_METRICS, Frame, metric_na
 from hood.rollouts.loop import own_start, simulate
 from hood.scene.body_motion.mesh_motion import NoBody, mesh_motion
 from hood.scene.scene import Scene, build_scene, dressed_scene
-from hood.solver import retry
+from hood.steppers import newton as stepping
 from hood.steppers.network import build_simulator
 from hood.steppers.newton import NewtonStepper, Stepper
 from hood.steppers.published import import_reference_weights
@@ -110,7 +110,7 @@ def test_coarse_cloth_rests_out_of_the_skin(garments: dict[str, Garment], body: 
         return len(np.unique(pairs[:, 0])) / len(coarse.faces)
 
     after = in_the_skin()
-    monkeypatch.setattr(retry, "MOST_RAISED", 0)
+    monkeypatch.setattr(stepping, "MOST_RAISED", 0)
     assert after <= CUT_SHARE < 0.02 < in_the_skin()
 
 
