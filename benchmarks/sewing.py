@@ -26,17 +26,15 @@ from pathlib import Path
 from types import FrameType
 
 import numpy as np
-import torch
 import yaml
 
 import hood
 from hood.assets.garment.garment import load_garment
 from hood.assets.pattern.designs import draft
+from hood.assets.pattern.fronts import opened
 from hood.assets.pattern.measures import measure_body
 from hood.assets.pattern.sheet import sheet_of
 from hood.cli.main import main as run_hood
-from hood.mesh.flat import edge_lengths
-from hood.mesh.topology import unique_edges
 
 #: Options of every variant, by design; the first of each has the defaults.
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -143,20 +141,28 @@ def wear(path: Path, motion: str, beta: float, frames: int) -> str:
 
 
 def off_pattern(path: Path, row: Row, edge: float) -> tuple[float, float]:
-    """How far a garment is from its pattern, on the body that it was made for: lengths at rest as a share, grain in degrees."""
+    """How far a garment is from its pattern, on the body that it was made for: lengths at rest as a share, elastic apart, and
+    grain in degrees."""
     body, betas, garment = hood.load_body(), np.array([row.beta]), load_garment(path)
     vertices, joints = body.shaped(betas)
     options = yaml.safe_load("{" + row.options.replace(":", ": ") + "}")
     sheet = sheet_of(draft(row.design, measure_body(vertices, body.faces, joints), options), edge, row.design)
     scene = hood.build_scene(garment, body, hood.load_sequence("plie"), hood.Material(warp=3.0), betas=betas)
+    sheet = sheet if len(sheet.faces) == len(garment.faces) else opened(sheet, sheet.pos)[0]  # a front that opens has a strip
     corners = sheet.flat[:, 1:] - sheet.flat[:, :1]
-    assert np.array_equal(sheet.faces, garment.faces)
-    faces = torch.as_tensor(garment.faces)
-    lengths = edge_lengths(torch.as_tensor(corners), faces, torch.as_tensor(unique_edges(garment.faces)))
+    assert scene.cloth.flat is not None
+    assert len(sheet.faces) == len(garment.faces)
+    own, cut = (_sides(edges) for edges in (scene.cloth.flat.double().numpy(), corners))
+    plain = np.ones(len(own), bool) if garment.elastic is None else (np.asarray(garment.elastic) == 1.0).all(axis=1)
     assert scene.cloth.grain is not None
     warp = np.einsum("fi,fix->fx", scene.cloth.grain.double().numpy(), corners)
     turn = np.degrees(np.abs(np.arctan2(warp[:, 0], warp[:, 1])))
-    return float((scene.cloth.rest_length.double() / lengths - 1.0).abs().max()), float(turn.max())
+    return float(np.abs(own[plain] / cut[plain] - 1.0).max()), float(turn.max())
+
+
+def _sides(edges: np.ndarray) -> np.ndarray:
+    """Lengths (F, 3) [m] of the sides of faces by two edges of each, (F, 2, 2)."""
+    return np.linalg.norm(np.concatenate([edges, edges[:, 1:] - edges[:, :1]], axis=1), axis=2)
 
 
 def line(row: Row) -> str:
