@@ -10,7 +10,7 @@ LOOSE := arg-type assignment call-arg call-overload dict-item index misc operato
 .PHONY: demo test tests lint style types slow envelope docs clean
 
 demo: $(VENV)/.demo
-	$(BIN)/hood rollout garment=swing_4k material=silk_crepe num_frames=100 output=outputs/demo
+	$(BIN)/hood rollout garment=swing_4k material=silk_crepe num_frames=60 output=outputs/demo
 	@echo "Look at outputs/demo/contact_sheet.png and outputs/demo/rollout.mp4"
 
 # Types are checked beside the tests: on one core they take half a minute.
