@@ -144,9 +144,7 @@ def _scene_pairs(scene: SceneLayers, pos: Tensor, index: int) -> tuple[Tensor, .
     weights = torch.as_tensor(found.weights, device=device)
     edges = torch.as_tensor(found.edges, device=device)
     x = pos[corners]
-    if x.requires_grad:
-        moved = nearest_weights(x, weights, edges)
-        weights = weights + (moved - moved.detach())
+    weights = _following(weights, x, edges)
     gap = (weights.unsqueeze(2) * x).sum(dim=1)
     dist = torch.linalg.vector_norm(gap, dim=1).clamp_min(1e-12)
     reach, area, parallel = (torch.as_tensor(values, device=device) for values in (found.reach, found.area, found.parallel))
@@ -197,19 +195,23 @@ def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
 
 
 def _followed_pressing(pairs: _Pairs, inertia: Tensor, there: Tensor, pull: Tensor | None, backed: Tensor) -> Tensor:
-    """The same as a function that autograd follows."""
+    """The same as a function that autograd follows.
+
+    Args:
+        inertia: (V,) N/m, mass over dt².
+        there: (V, 3) m, where vertices would fly to.
+        pull: (V, 3) N, forces of the cloth around with those of the pairs; None: not known.
+        backed: (V,) bool, something behind holds them.
+    """
     load = pairs.weights * pairs.force.unsqueeze(1)  # (N, 4) N, at the corners
     rows, normal = pairs.corners.reshape(-1), pairs.normal
     pushed = load.unsqueeze(2) * normal.unsqueeze(1)
     net = torch.zeros_like(there).index_add(0, rows, pushed.reshape(-1, 3))
-    spread = (load.abs().unsqueeze(2).unsqueeze(3) * (normal.unsqueeze(2) * normal.unsqueeze(1)).unsqueeze(1)).reshape(-1, 3, 3)
-    spread = there.new_zeros(len(there), 3, 3).index_add(0, rows, spread)
-    missing = (pairs.reach - ((pairs.weights.unsqueeze(2) * there[pairs.corners]).sum(dim=1) * normal).sum(dim=1)).clamp_min(
-        0.0
-    )
-    first = torch.arange(4, device=rows.device) < torch.where(pairs.edges, 2, 1).unsqueeze(
-        1
-    )  # (N, 4) corners of the first side
+    blocks = torch.einsum("nc,ni,nj->ncij", load.abs(), normal, normal).reshape(-1, 3, 3)
+    spread = there.new_zeros(len(there), 3, 3).index_add(0, rows, blocks)
+    missing = (pairs.reach - torch.einsum("nc,nci,ni->n", pairs.weights, there[pairs.corners], normal)).clamp_min(0.0)
+    first_side = torch.where(pairs.edges, 2, 1).unsqueeze(1)
+    first = torch.arange(4, device=rows.device) < first_side  # (N, 4) its corners
     outward = torch.where(first, 1.0, -1.0).unsqueeze(2) * normal.unsqueeze(1)  # (N, 4, 3)
     one = (net[pairs.corners] * outward).sum(dim=2)
     both = torch.einsum("nci,ncij,ncj->nc", outward, spread[pairs.corners], outward)
@@ -372,11 +374,8 @@ class LayerBarrier(Energy):
             for values in (found.weights, found.reach, found.area, found.parallel)
         )
         x = next_pos[torch.as_tensor(found.corners + scene.first, device=device)]
-        if x.requires_grad:
-            # The nearest points move along the features: nothing of first order, a part of the second derivative.
-            edges = torch.as_tensor(found.edges, device=device)
-            moved = nearest_weights(x, weights, edges)
-            weights = weights + (moved - moved.detach())
+        # The nearest points move along the features: nothing of first order, a part of the second derivative.
+        weights = _following(weights, x, torch.as_tensor(found.edges, device=device))
         gap = (weights.unsqueeze(2) * x).sum(dim=1)
         share = torch.linalg.vector_norm(gap, dim=1).clamp_min(_LEAST) / reach
         energy = self.pressure * area * reach * (1.0 - share) ** 2 * -share.log()
@@ -424,6 +423,14 @@ def nearest_weights(x: Tensor, known: Tensor, edges: Tensor) -> Tensor:
     of_face = of_face.index_put((rows, second), -v[:, 0], accumulate=True)
     found = torch.where(edges.unsqueeze(1), of_edges, of_face)
     return torch.where(told.unsqueeze(1), found, known)
+
+
+def _following(weights: Tensor, x: Tensor, edges: Tensor) -> Tensor:
+    """``weights`` (N, 4) with the derivatives of :func:`nearest_weights`, where the corners ``x`` (N, 4, 3) have any."""
+    if not x.requires_grad:
+        return weights
+    moved = nearest_weights(x, weights, edges)
+    return weights + (moved - moved.detach())
 
 
 def has_layers(potential: Potential) -> bool:

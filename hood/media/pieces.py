@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from hood.assets.material import Material, values_of
 from hood.media.renderer.render import FUZZ, GARMENT_COLOR, SHEEN
 from hood.mesh import topology
 from hood.rollouts.file.reader import RolloutData
 
-#: Of a fabric that nothing is known of [m]: that of the published code's.
-_THICKNESS = 4.7e-4
+#: Of a fabric that nothing is known of [m]: that of the default fabric.
+_THICKNESS = values_of(Material().thickness)[0].item()
 
 
 @dataclass(frozen=True)
