@@ -195,14 +195,8 @@ def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
 
 
 def _followed_pressing(pairs: _Pairs, inertia: Tensor, there: Tensor, pull: Tensor | None, backed: Tensor) -> Tensor:
-    """The same as a function that autograd follows.
-
-    Args:
-        inertia: (V,) N/m, mass over dt².
-        there: (V, 3) m, where vertices would fly to.
-        pull: (V, 3) N, forces of the cloth around with those of the pairs; None: not known.
-        backed: (V,) bool, something behind holds them.
-    """
+    """The same as a function that autograd follows, of mass over dt² (V,) [N/m], where vertices fly to (V, 3) [m], the forces
+    around (V, 3) [N] and what is held from behind (V,) bool."""
     load = pairs.weights * pairs.force.unsqueeze(1)  # (N, 4) N, at the corners
     rows, normal = pairs.corners.reshape(-1), pairs.normal
     pushed = load.unsqueeze(2) * normal.unsqueeze(1)
@@ -210,8 +204,8 @@ def _followed_pressing(pairs: _Pairs, inertia: Tensor, there: Tensor, pull: Tens
     blocks = torch.einsum("nc,ni,nj->ncij", load.abs(), normal, normal).reshape(-1, 3, 3)
     spread = there.new_zeros(len(there), 3, 3).index_add(0, rows, blocks)
     missing = (pairs.reach - torch.einsum("nc,nci,ni->n", pairs.weights, there[pairs.corners], normal)).clamp_min(0.0)
-    first_side = torch.where(pairs.edges, 2, 1).unsqueeze(1)
-    first = torch.arange(4, device=rows.device) < first_side  # (N, 4) its corners
+    none = torch.zeros_like(pairs.edges)
+    first = torch.stack([~none, pairs.edges, none, none], dim=1)  # (N, 4), the corners of its first side
     outward = torch.where(first, 1.0, -1.0).unsqueeze(2) * normal.unsqueeze(1)  # (N, 4, 3)
     one = (net[pairs.corners] * outward).sum(dim=2)
     both = torch.einsum("nci,ncij,ncj->nc", outward, spread[pairs.corners], outward)
