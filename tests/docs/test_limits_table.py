@@ -1,4 +1,4 @@
-"""The table of limits in docs/verdict.md is that of the code."""
+"""The table of limits in hood/studies/notes/verdict.md is that of the code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hood import limits
 from hood.limits import Limit, Range
 
-PAGE = Path(__file__).parents[2] / "docs" / "verdict.md"
+PAGE = Path(__file__).parents[2] / "hood" / "studies" / "notes" / "verdict.md"
 BEGIN, END = "<!-- limits: begin -->\n", "<!-- limits: end -->"
 
 
