@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Of benchmarks the types are checked for names that are not there, not for values.
 LOOSE := arg-type assignment call-arg call-overload dict-item index misc operator return-value union-attr var-annotated
 
-.PHONY: demo test tests lint style types slow envelope docs clean
+.PHONY: demo test tests lint style types slow envelope docs notebooks clean
 
 demo: $(VENV)/.demo
 	$(BIN)/hood rollout garment=swing_4k material=silk_crepe num_frames=60 output=outputs/demo
@@ -31,6 +31,10 @@ envelope: $(VENV)/.demo
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Open site/index.html"
+
+# The notebooks with what they print and draw; the tests run their code without Jupyter.
+notebooks: $(VENV)/.notebooks
+	$(BIN)/python -m tools.notebooks
 
 lint: style types
 
@@ -57,6 +61,10 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[docs]"
+	@touch $@
+
+$(VENV)/.notebooks: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt -e ".[notebooks]"
 	@touch $@
 
 clean:

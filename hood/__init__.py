@@ -23,6 +23,7 @@ _HOMES = {
     "dress": "hood.api",
     "differentiable": "hood.api",
     "export": "hood.api",
+    "view": "hood.api",
     "train": "hood.api",
     "load_model": "hood.api",
     "load_garment": "hood.assets.garment.garment",

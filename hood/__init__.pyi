@@ -7,6 +7,7 @@ from hood.api import (
     rollout as rollout,
     simulate as simulate,
     train as train,
+    view as view,
 )
 from hood.assets.body.body import Body as Body
 from hood.assets.body.load import load_body as load_body

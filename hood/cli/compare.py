@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from hood.app.common import held_folder, output_folder, require_package, split_words, thinning
 from hood.app.output.export import lay_on, read_checked, read_textures
+from hood.app.output.view import short_names
 from hood.app.settings.compose import ConfigError, require_choice, shown
 from hood.app.settings.record import read_record, read_words
 from hood.app.sweep import REASON, state_of
@@ -101,16 +102,6 @@ def _read(files: Sequence[Path], config: DictConfig) -> list[_Entry]:
     count = None if config.num_frames is None else int(config.num_frames)
     cut = require_same_motion(read, count)
     return [_Entry(*one) for one in zip(paths, short_names(paths), cut, strict=True)]
-
-
-def short_names(paths: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
-    parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
-    for length in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(part[-length:]) for part in parts]
-        if len(set(names)) == len(set(parts)):
-            break
-    return names
 
 
 def _shuffled(entries: Sequence[_Entry], seed: int) -> list[_Entry]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,14 +19,14 @@ import torch
 from omegaconf import DictConfig
 
 from hood.app.batch.manifest import UNJUDGED, Manifest
-from hood.app.common import frame_count, output_folder, prepare_folder, split_words
-from hood.app.output.export import export, lay_on, read_checked, read_textures, remove_whole
+from hood.app.common import prepare_folder
+from hood.app.output.export import export, remove_whole
+from hood.app.output.view import viewer_page
 from hood.app.settings.compose import ConfigError, load_config, plain
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import locate
-from hood.cli.compare import short_names
 from hood.rollouts.file.dataset import RolloutDataset
-from hood.rollouts.file.reader import RolloutData, published_bytes, read_published, read_rollout, write_rollout
+from hood.rollouts.file.reader import published_bytes, read_published, read_rollout, write_rollout
 from hood.steppers.checkpoint import CAUTION, load_simulator, read_header, save_simulator
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 
 _MODEL = ".safetensors"
 _PICKLES = (".pkl", ".pickle")
-#: More would be too narrow to see anything.
-_MOST = 4
 #: A page beyond this [bytes] is slow to send and to open.
 _HEAVY = 12_000_000
 
@@ -108,45 +105,14 @@ def _paths(config: DictConfig) -> tuple[Path, Path]:
 
 def view(arguments: Sequence[str]) -> int:
     """Run the command ``view``; returns the exit code."""
-    files, config = _split_view(arguments)
-    count = frame_count(config)
-    target = output_folder(config)
-    if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
-        raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
-    textures = read_textures(config)
-    rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
-    from hood.media.viewer.page import view_page
-
-    names = short_names(files)
-    title = " and ".join(names) if config.title is None else str(config.title)
-    page = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts)).encode()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(target, page)
-    frames = max(len(data.time) for data in rollouts)
-    print(f"{target}: {len(page) / 1e6:.1f} MB, {frames} frames; open it in a browser")
-    if len(page) > _HEAVY and frames > 1:
-        most = max(max(data.cloth_pos.shape[1], data.body_pos.shape[1]) for data in rollouts)
-        fewer = max(int(frames * _HEAVY / len(page)), 1)
-        print(f"that is a heavy page, of up to {most:,} vertices a mesh: num_frames={fewer} keeps it below {_HEAVY / 1e6:g} MB")
+    page = viewer_page(arguments)
+    size, target = len(page.text.encode()), page.save()
+    print(f"{target}: {size / 1e6:.1f} MB, {page.num_frames} frames; open it in a browser")
+    if size > _HEAVY and page.num_frames > 1:
+        fewer = max(int(page.num_frames * _HEAVY / size), 1)
+        mesh = f"of up to {page.most:,} vertices a mesh"
+        print(f"that is a heavy page, {mesh}: num_frames={fewer} keeps it below {_HEAVY / 1e6:g} MB")
     return 0
-
-
-def _split_view(arguments: Sequence[str]) -> tuple[list[Path], DictConfig]:
-    """Files in their order and the config: a word of the form ``key=value`` is an override, every other word a file."""
-    given, config = split_words("view", arguments)
-    if not 1 <= len(given) <= _MOST:
-        raise ConfigError(f"number of rollouts given: {len(given)}; give one to {_MOST}, hood view rollout.h5")
-    paths = [Path(name).expanduser() for name in given]
-    return [path / "rollout.h5" if path.is_dir() else path for path in paths], config
-
-
-def _first_frames(data: RolloutData, count: int | None) -> RolloutData:
-    if count is None:
-        return data
-    metrics = {name: values[:count] for name, values in data.metrics.items()}
-    return replace(
-        data, cloth_pos=data.cloth_pos[:count], body_pos=data.body_pos[:count], time=data.time[:count], metrics=metrics
-    )
 
 
 # ---- rollouts --------------------------------------------------------------------------------------------------------

@@ -78,3 +78,9 @@ def test_the_citation_is_that_of_the_readme_and_of_this_version() -> None:
     assert citation["version"] == hood.__version__
     assert paper["title"].replace("HOOD", "{HOOD}") in text_of(README)
     assert all(f"{author['family-names']}, {author['given-names']}" in text_of(README) for author in paper["authors"])
+
+
+def test_the_list_for_language_models_names_every_page() -> None:
+    text = (ROOT / "docs" / "llms.txt").read_text(encoding="utf-8")
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert set(re.findall(r"\((\w+\.md)\)", text)) == pages
