@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,16 @@ from hood.app.batch.batch import (
 )
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
-from hood.app.output.export import check_outputs, check_worn, export_beside, forms_beside, lay_on, read_textures, remove_earlier
+from hood.app.output.export import (
+    StreamedCaches,
+    check_outputs,
+    check_worn,
+    export_beside,
+    forms_beside,
+    lay_on,
+    read_textures,
+    remove_earlier,
+)
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
@@ -192,7 +202,9 @@ def _run_there(
     remove_earlier(folder, config)
     save_run_record(folder, config, int(config.seed))
     eases: list[Ease | None] = []
-    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
+    caches = StreamedCaches(folder / "rollout.h5", forms_beside(config), read_textures(config))
+    with closing(caches):
+        interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar, caches)
     data = read_rollout(folder / "rollout.h5")
     if not interrupted:
         make_compact(folder / "rollout.h5", store_of(config.formats), body)
@@ -202,7 +214,7 @@ def _run_there(
             judged = beside.submit(summarise, data)
             if not interrupted:
                 _draw(config, data, folder, bar)
-                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config))
+                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config), caches)
     finally:
         summary = _conclude(ready, folder, data, judged.result(), eases, advise)
         summary["warnings"] = list(warned)
@@ -260,10 +272,17 @@ def _run_all(config: RolloutSettings, jobs: list[Job], output: Path, bar: Bar) -
 
 
 def _simulate_to_disk(
-    ready: Setup, digest: str, path: Path, asked: RolloutSettings, eases: list[Ease | None], doubts: Sequence[Doubt], bar: Bar
+    ready: Setup,
+    digest: str,
+    path: Path,
+    asked: RolloutSettings,
+    eases: list[Ease | None],
+    doubts: Sequence[Doubt],
+    bar: Bar,
+    caches: StreamedCaches,
 ) -> bool:
-    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
-    ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
+    """Stream the rollout into ``path`` and ``caches``; True when the user interrupted it. ``asked`` is the config with ``auto``
+    in it, ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
     and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
@@ -345,6 +364,7 @@ def _simulate_to_disk(
             for frame in ridden_frames(shown, garment):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
+                caches.append(frame.world_pos.numpy(), frame.body_pos.numpy())
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped
