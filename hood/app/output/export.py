@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.app.batch.batch import STATE
 from hood.app.common import frame_count, split_words
 from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.app.settings.rollout_settings import Settings
@@ -343,14 +344,17 @@ def read_checked(path: Path, colour: str) -> RolloutData:
 _NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "plan.json")
 
 
-def remove_earlier(folder: Path, config: Settings) -> None:
-    """Remove summary, pictures, exports and plan of the rollout that was in ``folder``: they would pass for the next one's.
+def remove_earlier(folder: Path, config: Settings, goes_on: bool = False) -> None:
+    """Remove summary, pictures, exports, plan and state of the rollout that was in ``folder``: they would pass for the next
+    one's. Of one that ``goes_on`` the state and the point caches stay.
 
     The summary goes first: its presence says that everything is there. What ``config`` names as input stays.
     """
     given = {Path(word).expanduser().resolve() for word in _words(plain(config))}
-    for path in (*(folder / name for name in _NAMES), *exports_beside(folder / "rollout.h5")):
-        if path.resolve() not in given:
+    source = folder / "rollout.h5"
+    kept = {folder / STATE, _beside(source, "pc2")} if goes_on else set()
+    for path in (*(folder / name for name in _NAMES), *exports_beside(source), folder / STATE):
+        if path.resolve() not in given and path not in kept:
             remove_whole(path)
 
 
