@@ -132,7 +132,7 @@ def find_progress(folder: Path, config: RolloutSettings, digest: str, scene: Sce
     if found is None or why:
         say(f"resume=true: the rollout in {folder} is made again ({why})")
         return None
-    say(f"resume=true: {folder} has {found.done.frames} whole frames; the rollout goes on after them")
+    say(f"resume=true: {folder} goes on after frame {found.done.frames - 1}")
     return found
 
 

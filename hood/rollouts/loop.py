@@ -136,6 +136,10 @@ def simulate(
     prepared = prepare_stepper(stepper, scene)
     if goal is not None and isinstance(stepper, RefinedStepper):
         stepper.recall(goal)
+    if after is not None and scene.sizes.changing:  # what is kept of a cloth, as its layers, is of its size at first
+        step = scene.step_input(start_frame + after.index, after.state)
+        gravity = stepper.gravity.to(after.state.pos)
+        stepper.search(potential.prepare(StepProblem(scene.cloth, after.state, step, gravity=gravity)))
     rest = None
     if after is not None or start is not None:
         state = start if after is None else after.state
