@@ -184,10 +184,12 @@ def _read(folder: Path, attributes: Mapping[str, Any], scene: Scene) -> tuple[Pr
 def _made_of(scene: Scene) -> dict[str, str]:
     """What a rollout is simulated from, in digests: settings name files, and these may have changed."""
     body = scene.motion.surface(0, scene.motion.translation[0])
-    cloth = [scene.cloth] if scene.fastening is None else [scene.cloth, scene.fastening.pairs]
+    parts = [getattr(scene.cloth, part.name) for part in fields(scene.cloth)]
+    if scene.fastening is not None:
+        parts += [scene.fastening.row, scene.fastening.pairs.edges]
     return {
         "the version of hood or torch": f"{__version__} {torch.__version__}",
-        "the garment or its fabric": _digest([getattr(one, part.name) for one in cloth for part in fields(one)]),
+        "the garment or its fabric": _digest(parts),
         "the body": _digest([body, torch.as_tensor(scene.motion.faces)]),
     }
 

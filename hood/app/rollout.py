@@ -40,7 +40,7 @@ from hood.app.output.export import (
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
-from hood.app.progress import Progress, ProgressFile, find_progress, memories, recall
+from hood.app.progress import Progress, ProgressFile, find_progress, memories, recall, remembers
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.fabrics import fabric_names
 from hood.app.scene.garments import describe_ease, summarise_ease
@@ -347,6 +347,7 @@ def _simulate_to_disk(
         still=ridden_still(still, riders),
         steps=steps,
         done=None if begun is None else begun.done,
+        goes_on=not remembers(stepper),
     )
     frames = simulate(
         stepper,

@@ -108,7 +108,7 @@ class RolloutWriter:
     (:class:`hood.rollouts.file.step_table.StepTable`), and alarms count them.
 
     With ``done`` the file at ``path`` is of the same rollout, stopped: so much of it is taken over, and the new file takes its
-    place.
+    place. Where it ``goes_on`` later, frames stay where the disk refuses further ones; else the file goes away then.
     """
 
     def __init__(
@@ -129,8 +129,9 @@ class RolloutWriter:
         still: Mapping[str, np.ndarray] | None = None,
         steps: StepPlan | None = None,
         done: Done | None = None,
+        goes_on: bool = False,
     ) -> None:
-        self.path = path
+        self.path, self._goes_on = path, goes_on
         self.frames_done = self.alarms_done = 0
         # Windows does not rename a file that is open.
         self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
@@ -290,7 +291,7 @@ class RolloutWriter:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self.frames_done == 0:
+        if self.frames_done == 0 or (isinstance(error, OSError) and not self._goes_on):
             self.discard()
         elif isinstance(error, OSError):
             self._leave()
