@@ -17,6 +17,7 @@ from hood.media.pieces import pieces_by
 from hood.mesh.penetration.crossing import crossings, self_crossings
 from hood.mesh.topology import connected_components, unique_edges
 from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.verdict.causes import CROSSING_KINDS
 from hood.rollouts.verdict.frames import mask_of, runs_of, worst_frame
 from hood.rollouts.verdict.rule import Verdict, judge_rollout, stored_doubts
 from hood.rollouts.verdict.surface import Meshes, in_folds, meshes_of
@@ -139,7 +140,8 @@ def find_faults(data: RolloutData, verdict: Verdict) -> list[dict[str, Any]]:
     told = [(one.kind, one.frames, one.sentence, one.part) for one in verdict.reasons] if verdict.sound is False else []
     for doubt in verdict.doubts[len(stored_doubts(data)) :]:
         runs = tuple(runs_of(mask_of(doubt["frames"]))) if doubt["frames"] else ()
-        told.append((_OF_DOUBTS.get(doubt["kind"], doubt["kind"]), runs, doubt["sentence"], None))
+        crossed = (kind for kind, what in CROSSING_KINDS.values() if f"triangles of {what} pass" in doubt["sentence"])
+        told.append((next(crossed, doubt["kind"]), runs, doubt["sentence"], None))
     meshes = meshes_of(data)
     title, count = str(data.attributes.get("garment", "cloth")), meshes.cloth.shape[1]
     pieces = pieces_by(title, count, meshes.faces, {} if meshes.piece is None else {"piece": meshes.piece})
@@ -158,10 +160,6 @@ def find_faults(data: RolloutData, verdict: Verdict) -> list[dict[str, Any]]:
         named = [{**fault, "garment": name, what: own, "fix": fix} for name, own in rows if own]
         found += named or [{**fault, "fix": fix}]
     return found
-
-
-#: What a doubt of this kind is of, where the cloth has a fault.
-_OF_DOUBTS = {"garment": "cloth_through_cloth"}
 
 
 def _place(kind: str, data: RolloutData, meshes: Meshes, frame: int, part: int | None) -> tuple[str, np.ndarray]:
