@@ -5,7 +5,6 @@ Rows of fasteners (buttons, zippers, seams) of a scene, and when they are opened
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -46,18 +45,17 @@ def _tell(what: str, off: Tensor, start: int, by: int, dt: float) -> None:
     """Say how fast what is ``off`` (N,) [m] at ``start`` comes together; warns where that is too fast."""
     if not len(off) or not bool(torch.isfinite(off).all()):
         return
-    steps, (least, most) = steps_left(start, by, start, dt), (float(edge) for edge in torch.aminmax(off))
-    speeds = tuple(far / (steps * dt) for far in (least, most))
-    when = f"by {by * dt:.2f} s (frame {by})"
-    if not speeds[1] > FASTEST:
-        say(f"{what} from {start * dt:.2f} s (frame {start}) on, {when}, at {speeds[0]:.2f} to {speeds[1]:.2f} m/s")
+    least, most = (float(edge) for edge in torch.aminmax(off))
+    when, needed = f"by {by * dt:.2f} s (frame {by})", most / ((by - start) * dt)
+    if needed <= FASTEST:
+        low, high = (float(needed_speed(torch.tensor(far), steps_left(start, by, start, dt), dt)) for far in (least, most))
+        say(f"{what} from {start * dt:.2f} s (frame {start}) on, {when}, at {low:.2f} to {high:.2f} m/s")
         return
-    enough = math.ceil(most / (FASTEST * dt) - 1e-3)
-    later = next(frame for frame in itertools.count(by) if steps_left(start, frame, start, dt) >= enough)
+    later = start + math.ceil(most / (FASTEST * dt) - 1e-3) + 1
     warnings.warn(
-        f"{what} {when}: up to {most:.2f} m apart in frame {start}, which needs {speeds[1]:.2f} m/s, {speeds[1] - FASTEST:.2f} "
-        f"m/s more than the {FASTEST:g} m/s that is the most, so it is late; give by: frame {later} ({later * dt:.2f} s), or "
-        "begin earlier",
+        f"{what} {when}: up to {most:.2f} m apart in frame {start}, which needs {needed:.2f} m/s, {needed - FASTEST:.2f} m/s "
+        f"more than the {FASTEST:g} m/s that is the most, so it is late; give by: frame {later} ({later * dt:.2f} s), or begin "
+        "earlier",
         stacklevel=2,
     )
 

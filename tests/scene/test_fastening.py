@@ -88,7 +88,7 @@ def test_how_fast_a_row_closes_is_said_once_and_too_fast_is_warned_about() -> No
             made.at(10, apart(0.27, 0.09, 0.2), 1 / 30)
     assert heard == ["zip: closes from 0.33 s (frame 10) on, by 1.33 s (frame 40), at 0.10 to 0.30 m/s"]
     hasty = fastening(Event(10, "zip", True, by=14))
-    said = "up to 0.30 m apart in frame 10, which needs 3.00 m/s, 1.50 m/s more than the 1.5 m/s .* by: frame 17 .0.57 s.,"
+    said = "up to 0.30 m apart in frame 10, which needs 2.25 m/s, 0.75 m/s more than the 1.5 m/s .* by: frame 17 .0.57 s.,"
     with pytest.warns(UserWarning, match=f"zip: closes by 0.47 s .frame 14.: {said}"):
         hasty.at(10, apart(0.3, 0.1, 0.1), 1 / 30)
     assert float(needed_speed(torch.tensor(0.3), steps_left(10, 17, 10, 1 / 30), 1 / 30)) == pytest.approx(FASTEST)
