@@ -32,7 +32,8 @@ READERS = ("meshes", "motions")
 KINDS = ("features", "outputs", "networks", "commands", "planners", *READERS)
 #: Suffixes that mean something already.
 TAKEN = frozenset(
-    "npz npy pkl pickle pk p joblib obj ply off stl glb gltf txt json csv h5 hdf5 safetensors pth pt ckpt".split()
+    "npz npy pkl pickle pk p joblib obj ply off stl glb gltf usd usda usdc usdz pc2 mdd txt json csv h5 hdf5 safetensors pth "
+    "pt ckpt".split()
 )
 
 

@@ -74,8 +74,8 @@ def test_messages_name_it_and_extras_that_it_has() -> None:
     assert PROJECT["name"] == DISTRIBUTION != "hood"
     assert PROJECT["version"] == hood.__version__
     asked = [name for _, text in texts() for name in re.findall(r"\binstall\(['\"](\w+)['\"]\)", text)]
-    assert {"pictures", "usd"} <= set(asked) <= EXTRAS
-    assert install("usd") == f'pip install "{DISTRIBUTION}[usd]"'
+    assert {"pictures"} <= set(asked) <= EXTRAS
+    assert install("charts") == f'pip install "{DISTRIBUTION}[charts]"'
 
 
 def test_what_is_built_installs_and_runs(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from hood.assets.files.guarded import guarded, listed, own_group
 from hood.assets.files.library import RENAMED, names, nearest, require_readable
 from hood.assets.formats.gltf import read_gltf
 from hood.assets.formats.mesh_file import mesh_suffixes, split_object
-from hood.assets.formats.vertex_files import CACHE_SUFFIX
+from hood.assets.formats.usd import USD_SUFFIXES, moves
+from hood.assets.formats.vertex_files import CACHE_SUFFIXES
 from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import body_kind
 from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain_content, read_content
@@ -57,7 +58,9 @@ def identify(name: str) -> str:
     if suffix in (".glb", ".gltf"):
         gltf = read_gltf(path)
         return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
-    if suffix == CACHE_SUFFIX:
+    if suffix in USD_SUFFIXES:
+        return MOVING_MESH if moves(path) else GARMENT
+    if suffix in CACHE_SUFFIXES:
         return MOVING_MESH
     if suffix in mesh_suffixes():
         return GARMENT

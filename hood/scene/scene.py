@@ -200,7 +200,7 @@ class Scene:
         """What is prescribed for ``frame`` → ``frame + 1``; a relaxing step freezes the body at ``frame``. Without
         ``attachments`` they are those of the scene's fastening. Where the body is ``jumping``, held vertices jump with it."""
         if attachments is None and self.fastening is not None:
-            attachments = self.fastening.at(frame)
+            attachments = self.fastening.at(frame, None if relaxing else state.pos, self.dt)
         origin = state.origin[0].numpy()
         pins = None
         cloth = self.cloth if self.holding is None or relaxing else self.holding.cloth(self.cloth, frame)

@@ -15,7 +15,7 @@ from hood.app.settings.rollout_settings import RolloutSettings
 from hood.assets.garment.garment import Garment, save_garment
 from hood.cli.main import main
 from hood.rollouts.file.reader import RolloutData, read_rollout
-from hood.scene.holding import SPEED
+from hood.scene.holding import FASTEST, SPEED
 from hood.testing import grid
 
 ROLLOUT = ["rollout", "garment=flag.npz", "body=none", "sequence=none", "stepper=newton", "cloth_contact=off", "video=none",
@@ -71,6 +71,33 @@ def test_a_row_opens_and_closes_without_a_jump(capsys: pytest.CaptureFixture[str
     line = f"seam (3 pairs): opened at 0.33 s (frame 10); closing from 0.50 s (frame 15) on, within 1 mm at {first / 30:.2f} s"
     assert line in capsys.readouterr().out
     assert data.still["fastened"].tolist() == ROW.tolist()
+
+
+def test_a_row_is_closed_by_a_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    opened = "{frame: 4, open: seam}"
+    slow, _ = rollout("num_frames=32", f"events=[{opened}, {{frame: 12, close: seam}}]")
+    assert off(slow)[28].max() > 0.05  # at the usual speed it is late
+    data, summary = rollout("num_frames=32", f"events=[{opened}, {{time: 0.4, close: seam, by: 0.95}}]")
+    assert np.abs(off(data)[28:]).max() < 1e-3
+    assert off(data)[24].min() > 1e-3
+    (_, event) = summary["fasteners"]["seam"]["events"]
+    assert (event["frame"], event["by_frame"], event["in_time"]) == (12, 28, 3)
+    assert event["apart_max_m"] == pytest.approx(off(data)[12].max(), abs=1e-6)
+    told = capsys.readouterr().out
+    assert "seam: closes from 0.40 s (frame 12) on, by 0.93 s (frame 28), at " in told
+    assert "closing from 0.40 s (frame 12) on, 3 of 3 pairs within 1 mm by frame 28, within 1 mm at" in told
+
+
+def test_a_row_that_cannot_be_closed_in_time_is_warned_about() -> None:
+    data, summary = rollout("num_frames=16", "events=[{frame: 0, open: seam}, {frame: 11, close: seam, by: 12}]")
+    (warning,) = [line for line in summary["warnings"] if line.startswith("seam: closes by")]
+    assert "m/s more than the 1.5 m/s" in warning
+    assert summary["fasteners"]["seam"]["events"][1]["in_time"] == 0
+    assert -np.diff(off(data)[11:14].max(axis=1)).max() < FASTEST / 30 + 1e-3
+    _, summary = rollout("num_frames=6", "events=[{frame: 0, open: seam}, {frame: 3, close: seam, by: 9}]")
+    (warning,) = [line for line in summary["warnings"] if line.startswith("events[1]")]
+    assert "by 0.30 s (frame 9) is after the last frame, 0.17 s (frame 5)" in warning
+    assert summary["fasteners"]["seam"]["events"][1]["in_time"] is None
 
 
 def test_what_is_closed_first_is_open_before() -> None:
@@ -160,6 +187,12 @@ def test_events_of_a_config() -> None:
         (["events=[{time: 1, close: a, speed: 0}]"], r"events\[0\]: speed is 0; give a speed > 0 in m/s, such as speed: 0.25"),
         (["events=[{time: 1, open: a, speed: 1}]"], r"events\[0\]: speed belongs to close and attach; open acts at once"),
         (["events=[{frame: 1, attach: hem}]", "step=fixed"], r"events\[0\]: step=fixed has fixed shapes"),
+        (["events=[{frame: 1, close: a, by: 9}]", "step=fixed"], r"step=fixed has fixed shapes, in which no speed changes"),
+        (["events=[{frame: 1, open: a, by: 9}]"], r"events\[0\]: by belongs to close and attach; open acts at once"),
+        (["events=[{frame: 1, close: a, by: 9, speed: 1}]"], r"events\[0\] has speed and by; give one"),
+        (["events=[{frame: 9, close: a, by: 9}]"], r"by is 9; give a frame after frame: 9, as frame is given"),
+        (["events=[{frame: 1, close: a, by: 9.5}]"], r"by is 9.5; give a frame after"),
+        (["events=[{time: 1, close: a, by: soon}]"], r"by is soon; give seconds after time: 1"),
     ],
 )
 def test_what_is_no_event_names_its_place_and_the_fix(words: list[str], message: str) -> None:
@@ -174,6 +207,11 @@ def test_what_is_no_event_names_its_place_and_the_fix(words: list[str], message:
         (
             "[{time: 0.1, open: seam}, {frame: 3, close: seam}]",
             "events[1]: closes seam in frame 3, where events[0] does",
+        ),
+        ("[{time: 1.0, open: seam}, {time: 1.01, close: seam, by: 1.05}]", "events[1]: by is 1.05, no step after it begins"),
+        (
+            "[{frame: 1, close: seam, by: 6}, {frame: 3, open: seam}]",
+            "events[0]: closes seam by frame 6, and events[1] opens it in frame 3, before; give by an earlier time",
         ),
         ("[{time: 0, detach: [20]}]", "events[0]: detach: none of these vertices are held then; pins=… holds vertices"),
         ("[{time: 0, attach: pins}]", "events[0]: attach: all of these vertices are held already"),

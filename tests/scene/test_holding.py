@@ -45,6 +45,21 @@ def test_what_is_taken_hold_of_comes_at_its_speed_beside_the_body(tank_scene: Sc
     assert torch.equal(scene.step_input(2, State(pos, state.vel, state.origin), jumping=True).pin_target, there)
 
 
+def test_what_is_taken_hold_of_is_there_by_its_frame(tank_scene: Scene) -> None:
+    """All arrive together, wherever a rollout begins."""
+    scene = replace(tank_scene, holding=Holding((Grasp(2, some(tank_scene, 0, 1), True, by=12),)))
+    state = scene.start()
+    origin = state.origin[0].numpy()
+    for frame, share in ((2, 7 / 8), (5, 4 / 5), (9, 0.0), (10, 0.0)):
+        here, there = (scene.motion.skinned(scene.garment, at, origin) for at in (frame, frame + 1))
+        pos = here.clone()
+        pos[0, 1] += 0.04
+        pos[1, 2] -= 0.02
+        target = scene.step_input(frame, State(pos, state.vel, state.origin)).pin_target
+        assert target is not None
+        torch.testing.assert_close((target - there)[:2], share * (pos - here)[:2], rtol=0, atol=1e-6)
+
+
 def test_pins_that_were_there_are_where_they_were(skirt_scene: Scene) -> None:
     hem = int(skirt_scene.cloth.rest_pos[:, 1].argmin())
     scene = replace(skirt_scene, holding=Holding((Grasp(3, some(skirt_scene, hem), True, 0.3),)))

@@ -7,7 +7,6 @@ Files of the rollout that was in a folder before: without them, what lies there 
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,8 +21,8 @@ from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import unknown
-from hood.assets.files.said import install
 from hood.assets.formats.image import Texture, read_texture
+from hood.assets.formats.usd import NO_USD, has_usd
 from hood.assets.garment.garment import Garment
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd
 from hood.media.exports.sequences import (
@@ -31,6 +30,7 @@ from hood.media.exports.sequences import (
     Clip,
     PointCacheFiles,
     clip_of,
+    write_mdd,
     write_obj_sequence,
     write_ply_sequence,
     write_point_cache,
@@ -43,6 +43,7 @@ from hood.rollouts.file.recorder import still_of
 _SUFFIXES = {"usd": (".usd", ".usdc", ".usda"), "glb": (".glb",)}
 _FOLDERS: dict[str, Callable[[Path, Clip], None]] = {
     "pc2": write_point_cache,
+    "mdd": write_mdd,
     "obj": write_obj_sequence,
     "ply": write_ply_sequence,
 }
@@ -50,7 +51,7 @@ FORMATS = ("usd", "glb", *_FOLDERS)
 #: Cloth is no thicker [m].
 _THICKEST = 0.02
 #: Those that hold images.
-_TEXTURED = ("usd", "glb", "pc2", "obj")
+_TEXTURED = ("usd", "glb", "pc2", "mdd", "obj")
 
 
 def export(arguments: Sequence[str]) -> tuple[Path, list[str]]:
@@ -157,7 +158,7 @@ class StreamedCaches:
             self._ended = True
             return
         data, target = read_checked(self._source, "fabric"), _beside(self._source, "pc2")
-        _write(target, "pc2", clip_of(data, textures=lay_on(self._textures, [data])[0]), "y", replace=True)
+        _write(target, "pc2", clip_of(data, textures=lay_on(self._textures, [data])[0]), _Wanted(), replace=True)
         self._files = PointCacheFiles(target, data)
 
     def holds(self, data: RolloutData) -> bool:
@@ -185,7 +186,7 @@ def _export(
     try:
         clip = clip_of(data, wanted.parts, wanted.num_frames, wanted.up, lay_on(textures, [data])[0], layers)
         if replace is not None:
-            _write(target, form, clip, wanted.up, replace)
+            _write(target, form, clip, wanted, replace)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
     names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
@@ -206,6 +207,7 @@ class _Wanted(NamedTuple):
     num_frames: int | None = None
     up: str = "y"
     thickness: float | None = 0.0  # m of the cloth; None: that of its fabrics
+    velocities: bool = False  # of glb
 
 
 def _millimetres(thickness: np.ndarray) -> str:
@@ -225,7 +227,16 @@ def _checked(config: DictConfig) -> tuple[str, _Wanted]:
     parts = parts if isinstance(parts, list) else [parts]
     if not parts or any(part not in PARTS for part in parts):
         raise ConfigError(f"parts={plain(config.parts)}: give some of [cloth,body]")
-    return form, _Wanted(parts, frame_count(config), up, _thickness(config))
+    return form, _Wanted(parts, frame_count(config), up, _thickness(config), _velocities(config, form))
+
+
+def _velocities(config: DictConfig, form: str) -> bool:
+    """Whether glb has velocities; usd always has them."""
+    if not isinstance(config.velocities, bool):
+        raise ConfigError(f"velocities={shown(config.velocities)}: give true or false")
+    if config.velocities and form not in _SUFFIXES:
+        raise ConfigError(f"velocities=true: format={form} holds positions alone; take format={' or '.join(_SUFFIXES)}")
+    return bool(config.velocities)
 
 
 def _thickness(config: DictConfig) -> float | None:
@@ -243,12 +254,12 @@ def _thickness(config: DictConfig) -> float | None:
 
 def _check_format(form: str, key: str, asked: str) -> None:
     if form.lower() in ("abc", "alembic"):
-        raise ConfigError(f"{asked}: no maintained package writes Alembic; take {key}=usd, which the same programs read")
+        raise ConfigError(f"{asked}: Alembic is not written (Python has no official package); take {key}=usd: they read it too")
     if form not in FORMATS:
         layouts = STORES[1:] if key == "formats" else ()
         raise ConfigError(f"{asked}: choose {' or '.join([*FORMATS, *layouts])}")
-    if form == "usd" and importlib.util.find_spec("pxr") is None:
-        raise ConfigError(f"{asked}: writing needs usd-core ({install('usd')}); glb, pc2, obj and ply need nothing more")
+    if form == "usd" and not has_usd():
+        raise ConfigError(f"{asked}: writing {NO_USD}; glb, pc2, mdd, obj and ply need nothing more")
 
 
 def exports_beside(source: Path) -> list[Path]:
@@ -275,17 +286,17 @@ def _target(config: Settings, source: Path, form: str) -> Path:
     return target
 
 
-def _write(target: Path, form: str, clip: Clip, up: str, replace: bool = False) -> None:
+def _write(target: Path, form: str, clip: Clip, wanted: _Wanted, replace: bool = False) -> None:
     """Write the whole, or nothing; a folder that is not empty only to ``replace`` it."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if form == "glb":
-        write_atomically(target, gltf_bytes(clip))
+        write_atomically(target, gltf_bytes(clip, wanted.velocities))
         return
     draft = target.with_name(f".partial.{target.name}")  # USD tells the format by the suffix
     remove_whole(draft)
     try:
         if form == "usd":
-            write_usd(draft, clip, up, target.name)
+            write_usd(draft, clip, wanted.up, target.name)
             for part in clip.parts:
                 if part.texture is not None:
                     write_atomically(target.with_name(image_name(target.stem, part)), part.texture.content)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,20 +42,20 @@ def summarise_fasteners(data: RolloutData) -> dict[str, Any]:
     off = np.abs(apart - length)
     rows = {}
     for number, name in enumerate(known["names"]):
-        events = [(frame, closes) for frame, event, closes in known["events"] if event == name]
+        events = [(frame, closes, *by) for frame, event, closes, *by in known["events"] if event == name]
         if name in known["closed_at_first"]:
             events.insert(0, (-1, True))
         rows[name] = _row(off[:, row == number], events, data.step_time)
     return {"fasteners": rows}
 
 
-def _row(off: np.ndarray, events: list[tuple[int, bool]], time: np.ndarray) -> dict[str, Any]:
+def _row(off: np.ndarray, events: list[tuple], time: np.ndarray) -> dict[str, Any]:
     """Of deviations (T, P) [m] of a row's pairs; an event acts in the frame after its own for the first time."""
     reported, worst, last = [], [], len(off) - 1
-    for place, (frame, closes) in enumerate(events):
+    for place, (frame, closes, *due) in enumerate(events):
         if frame >= last:
             break
-        end = min((later for later, _ in events[place + 1 :]), default=last)
+        end = min((later for later, *_ in events[place + 1 :]), default=last)
         phase = off[frame + 1 : end + 1].max(axis=1)
         within = np.flatnonzero(phase <= CLOSED)
         first = int(frame + 1 + within[0]) if closes and len(within) else None
@@ -70,10 +70,14 @@ def _row(off: np.ndarray, events: list[tuple[int, bool]], time: np.ndarray) -> d
                 "within_time": None if first is None else float(time[first]),
                 "left_open": int((off[min(end, last)] > CLOSED).sum()),
             }
+            if due:  # the frame by which it is to be closed
+                (by,) = due
+                there = int((off[by] <= CLOSED).sum()) if by <= last else None
+                event |= {"by_frame": by, "in_time": there, "apart_max_m": float(off[frame].max())}
         reported.append(event)
     return {
         "pairs": off.shape[1],
-        "closed_at_first": bool(events and events[0] == (-1, True)),
+        "closed_at_first": bool(events and events[0][:2] == (-1, True)),
         "events": reported,
         "off_while_closed_max_m": max(worst, default=None),
     }
@@ -96,9 +100,12 @@ def _sentence(event: Mapping[str, Any], pairs: int) -> str:
     when = f"{event['time']:.2f} s (frame {event['frame']})"
     if event["action"] == "open":
         return f"opened at {when}"
+    said = f"closing from {when} on"
+    if event.get("in_time") is not None:
+        said += f", {event['in_time']} of {pairs} pairs within 1 mm by frame {event['by_frame']}"
     if event["within_frame"] is None:
-        return f"closing from {when} on, {event['left_open']} of {pairs} pairs still apart in the end"
-    return f"closing from {when} on, within 1 mm at {event['within_time']:.2f} s (frame {event['within_frame']})"
+        return f"{said}, {event['left_open']} of {pairs} pairs still apart in the end"
+    return f"{said}, within 1 mm at {event['within_time']:.2f} s (frame {event['within_frame']})"
 
 
 def summarise_held(scene: Scene, data: RolloutData) -> dict[str, Any]:
@@ -154,7 +161,7 @@ ROWS, VERTICES = {"open": False, "close": True}, {"detach": False, "attach": Tru
 ACTIONS = (*ROWS, *VERTICES)
 #: Those that bring together what is apart, at their speed.
 TOGETHER = tuple(name for name, together in (ROWS | VERTICES).items() if together)
-_KEYS = ("time", "frame", "speed", *ACTIONS)
+_KEYS = ("time", "frame", "speed", "by", *ACTIONS)
 _FORM = "events=[{time: 2.0, open: front_buttons}, {frame: 120, close: front_buttons}, {time: 3.0, detach: waistband}]"
 #: The pins that the garment has, as a name in attach and detach.
 PINS = "pins"
@@ -170,10 +177,26 @@ class Asked:
     action: str
     names: tuple[str | int, ...]
     speed: float = SPEED  # m/s
+    by: float | int | None = None  # as ``moment``: when what it brings together is there, at the speed that this takes
 
     def first_step(self, dt: float) -> int:
         """The frame whose step is the first with it."""
         return int(self.moment) if self.in_frames else first_step(float(self.moment), dt)
+
+    def last_frame(self, dt: float) -> int | None:
+        """The frame by which what it brings together is there; None: whenever it is.
+
+        Raises:
+            ConfigError: no step lies between.
+        """
+        if self.by is None:
+            return None
+        frame, begins = int(self.by) if self.in_frames else math.floor(float(self.by) / dt + 1e-6), self.first_step(dt)
+        if frame <= begins:
+            raise ConfigError(
+                f"events[{self.index}]: by is {self.by}, no step after it begins (frame {begins}); give a later one"
+            )
+        return frame
 
 
 def checked_events(config: RolloutSettings) -> tuple[Asked, ...]:
@@ -186,11 +209,10 @@ def checked_events(config: RolloutSettings) -> tuple[Asked, ...]:
     if not isinstance(given, list):
         raise ConfigError(f"events={given}: give a list, {_FORM}")
     asked = tuple(_asked(index, event) for index, event in enumerate(given))
-    held = next((one for one in asked if one.action in VERTICES), None)
+    held = next((one for one in asked if one.action in VERTICES or one.by is not None), None)
     if held is not None and fixed_shapes(config):
-        raise ConfigError(
-            f"events[{held.index}]: step={config.step} has fixed shapes, in which the same vertices are held; use step=plain"
-        )
+        what = "the same vertices are held" if held.action in VERTICES else "no speed changes"
+        raise ConfigError(f"events[{held.index}]: step={config.step} has fixed shapes, in which {what}; use step=plain")
     return asked
 
 
@@ -211,9 +233,8 @@ def _asked(index: int, event: Any) -> Asked:
     if not number or (moments[0] == "frame" and value != int(value)):
         fix = "seconds >= 0, such as time: 2.0" if moments[0] == "time" else "a whole number >= 0, such as frame: 60"
         raise ConfigError(f"{where}: {moments[0]} is {value}; give {fix}")
-    return Asked(
-        index, value, moments[0] == "frame", action, _names(where, action, event[action]), _speed(where, action, event)
-    )
+    names, speed = _names(where, action, event[action]), _speed(where, action, event)
+    return Asked(index, value, moments[0] == "frame", action, names, speed, _by(where, moments[0], action, event))
 
 
 def _speed(where: str, action: str, event: dict[str, Any]) -> float:
@@ -224,6 +245,22 @@ def _speed(where: str, action: str, event: dict[str, Any]) -> float:
     if "speed" in event and action not in TOGETHER:
         raise ConfigError(f"{where}: speed belongs to {' and '.join(TOGETHER)}; {action} acts at once, leave speed out")
     return float(speed)
+
+
+def _by(where: str, moment: str, action: str, event: dict[str, Any]) -> float | int | None:
+    """When what comes together is there, in the unit of its ``moment``."""
+    by = event.get("by")
+    if by is None:
+        return None
+    if action not in TOGETHER:
+        raise ConfigError(f"{where}: by belongs to {' and '.join(TOGETHER)}; {action} acts at once, leave by out")
+    if "speed" in event:
+        raise ConfigError(f"{where} has speed and by; give one: by takes the speed that is needed")
+    number = isinstance(by, (int, float)) and not isinstance(by, bool) and event[moment] < by < math.inf
+    if not number or (moment == "frame" and by != int(by)):
+        unit = "seconds" if moment == "time" else "a frame"
+        raise ConfigError(f"{where}: by is {by}; give {unit} after {moment}: {event[moment]}, as {moment} is given")
+    return by
 
 
 def _names(where: str, action: str, given: Any) -> tuple[str | int, ...]:
@@ -243,7 +280,7 @@ def with_events(scene: Scene, config: RolloutSettings) -> Scene:
     """
     asked = checked_events(config)
     for one in asked:
-        _warn_if_late(one, one.first_step(scene.dt), min(int(config.num_frames), scene.num_frames), scene.dt)
+        _warn_if_late(one, min(int(config.num_frames), scene.num_frames), scene.dt)
     scene = _with_rows(scene, [one for one in asked if one.action in ROWS])
     return _with_grasps(scene, [one for one in asked if one.action in VERTICES])
 
@@ -268,8 +305,20 @@ def _with_rows(scene: Scene, asked: list[Asked]) -> Scene:
                     f"events[{one.index}]: {one.action}s {name} in frame {frame}, where events[{other[0]}] does the opposite; "
                     "give them different times"
                 )
-            events[frame, name] = one.index, Event(frame, name, ROWS[one.action], one.speed)
+            events[frame, name] = one.index, Event(frame, name, ROWS[one.action], one.speed, one.last_frame(scene.dt))
+    _check_not_between(list(events.values()))
     return replace(scene, fastening=scene.fastening.with_events([event for _, event in events.values()]))
+
+
+def _check_not_between(events: Sequence[tuple[int, Event]]) -> None:
+    """Refuse a row that opens again before it is to be closed."""
+    for index, event in events:
+        for other, later in events:
+            if later.name == event.name and not later.closes and event.frame < later.frame < (event.by or 0):
+                raise ConfigError(
+                    f"events[{index}]: closes {event.name} by frame {event.by}, and events[{other}] opens it in frame "
+                    f"{later.frame}, before; give by an earlier time"
+                )
 
 
 def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
@@ -292,7 +341,7 @@ def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
                 f"{where}: {one.action}: another event in frame {frame} does the opposite to some of these vertices"
             )
         held, soft = (held | vertices, soft) if holds else (held & ~vertices, soft & ~vertices)
-        grasps.append(Grasp(frame, vertices, holds, one.speed))
+        grasps.append(Grasp(frame, vertices, holds, one.speed, one.last_frame(scene.dt)))
     return replace(scene, holding=Holding(tuple(grasps)))
 
 
@@ -315,21 +364,29 @@ def _soft(scene: Scene) -> Tensor:
     return torch.zeros_like(scene.cloth.pinned) if soft is None else soft > 0
 
 
-def _warn_if_late(event: Asked, frame: int, num_frames: int, dt: float) -> None:
+def _warn_if_late(event: Asked, num_frames: int, dt: float) -> None:
+    frame, by, last = event.first_step(dt), event.last_frame(dt), max(num_frames - 1, 0)
+    where = f"events[{event.index}]"
     if frame > num_frames - 2:
         warnings.warn(
-            f"events[{event.index}]: no step begins at {frame * dt:.2f} s (frame {frame}) or later, the last one begins at "
+            f"{where}: no step begins at {frame * dt:.2f} s (frame {frame}) or later, the last one begins at "
             f"{max(num_frames - 2, 0) * dt:.2f} s; it has no effect",
+            stacklevel=3,
+        )
+    elif by is not None and by > last:
+        warnings.warn(
+            f"{where}: by {by * dt:.2f} s (frame {by}) is after the last frame, {last * dt:.2f} s (frame {last}); what it "
+            "brings together is not there before",
             stacklevel=3,
         )
 
 
 def fastening_attributes(scene: Scene) -> dict[str, Any]:
     """What ``rollout.h5`` says of fasteners beside their pairs: names of the rows, those that are closed at first, and events,
-    each a frame, a row and whether it closes. Nothing of scenes without any."""
+    each a frame, a row, whether it closes, and the frame by which, where that is asked. Nothing of scenes without any."""
     fastening = scene.fastening
     if fastening is None:
         return {}
-    events = [[event.frame, event.name, event.closes] for event in fastening.events]
+    events = [[event.frame, event.name, event.closes, *([event.by] if event.by else [])] for event in fastening.events]
     closed = [name for name, state in zip(fastening.names, fastening.closed(-1), strict=True) if state]
     return {"fastening": {"names": list(fastening.names), "closed_at_first": closed, "events": events}}

@@ -22,7 +22,7 @@ from hood import plugins
 from hood.assets.files.guarded import first_line, unreadable
 
 _SCENES = {
-    ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD", ".fbx": "FBX", ".dae": "COLLADA", ".blend": "Blender",
+    ".fbx": "FBX", ".dae": "COLLADA", ".blend": "Blender",
     ".max": "3ds Max", ".mb": "Maya", ".ma": "Maya", ".abc": "Alembic", ".bvh": "BVH", ".c3d": "C3D", ".trc": "TRC",
 }  # fmt: skip
 #: How each kind of asset gets out of a scene file.
@@ -38,6 +38,7 @@ _WAY_OUT = {
 _SIZED = re.compile(r"(.+)(_\d+k)")
 #: Plugins' readers of the kind, see :mod:`hood.plugins`.
 _READERS = {"garments": ("meshes",), "motions": ("motions",), "body": (), "file": ("meshes", "motions")}
+_ALEMBIC = "Python has no official package for them; export USD, which the same programs write, and give {stem}.usd"
 #: Files of markers, which are no skeleton yet.
 _MARKERS = (".c3d", ".trc")
 _FITTED = "fit SMPL to its markers (MoSh++, SOMA) and give the .npz that comes out"
@@ -56,6 +57,7 @@ def require_readable(path: Path, kind: str) -> None:
     if suffix not in _SCENES or kind not in _WAY_OUT or any(suffix[1:] in plugins.names(group) for group in _READERS[kind]):
         return
     way = _FITTED if suffix in _MARKERS else _BVH_BODY if suffix == ".bvh" and kind != "garments" else _WAY_OUT[kind]
+    way = _ALEMBIC if suffix == ".abc" else way
     raise ValueError(f"{path}: {_SCENES[suffix]} files are not read; {way.format(stem=path.stem)}")
 
 

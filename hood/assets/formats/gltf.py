@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hood.assets.files.guarded import Refused, check_size, guarded
 from hood.assets.files.library import SIZE_LIMIT
 from hood.assets.files.text import decoded_text_file
-from hood.assets.formats.raw_mesh import RawMesh, Unreadable, named_polygons, unit_colours
+from hood.assets.formats.raw_mesh import RawMesh, Unreadable, join_meshes, named_polygons, unit_colours
 
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5125: 4294967295}
@@ -190,7 +190,7 @@ def read_glb(path: Path) -> RawMesh:
                 names.append((name or str(gltf.item("meshes", mesh).get("name", "")), _material(gltf, primitive)))
     if not parts:
         raise Unreadable("the scene has no mesh of triangles")
-    joined = _join(parts)
+    joined = join_meshes(parts)
     of_polygons = np.repeat(np.arange(len(parts)), [len(part.counts) for part in parts])
     joined.panels, notes = named_polygons([tuple(filter(None, own)) for own in names], of_polygons)
     joined.notes += notes
@@ -270,21 +270,3 @@ def _as_triangles(indices: np.ndarray, mode: int) -> np.ndarray:
         return np.stack([np.broadcast_to(indices[:1], number.shape), indices[number + 1], indices[number + 2]], axis=1)
     odd = number % 2
     return np.stack([indices[number], indices[number + 1 + odd], indices[number + 2 - odd]], axis=1)
-
-
-def _join(parts: list[RawMesh]) -> RawMesh:
-    """Several primitives as one mesh; what only some of them have is not kept, and noted."""
-    if len(parts) == 1:
-        return parts[0]
-    offsets = np.cumsum([0, *(len(part.pos) for part in parts)])
-    corners = np.concatenate([part.corners + offset for part, offset in zip(parts, offsets, strict=False)])
-    joined = RawMesh(np.concatenate([part.pos for part in parts]), corners, np.concatenate([part.counts for part in parts]))
-    for name, what in (("uv", "texture coordinates"), ("normals", "normals"), ("colours", "colours")):
-        tables = [getattr(part, name) for part in parts]
-        if all(table is not None for table in tables):
-            setattr(joined, name, np.concatenate(tables))
-        elif any(table is not None for table in tables):
-            joined.notes.append(f"only some parts have {what}; they are not kept")
-    joined.uv_corners = corners if joined.uv is not None else None
-    joined.normal_corners = corners if joined.normals is not None else None
-    return joined

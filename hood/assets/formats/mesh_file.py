@@ -20,6 +20,7 @@ from hood.assets.formats.gltf import read_glb
 from hood.assets.formats.obj_off_stl import read_obj, read_off, read_stl
 from hood.assets.formats.ply import read_ply
 from hood.assets.formats.raw_mesh import RawMesh, Unreadable
+from hood.assets.formats.usd import USD_SUFFIXES, read_usd
 from hood.mesh.editing.quality import MAX_CORNERS, far_vertex, triangulate
 from hood.mesh.parts import part_labels
 
@@ -30,6 +31,7 @@ _READERS: dict[str, Callable[[Path], RawMesh]] = {
     ".stl": read_stl,
     ".glb": read_glb,
     ".gltf": read_glb,
+    **dict.fromkeys(USD_SUFFIXES, read_usd),
 }
 #: Formats that keep a corner of every face or every texture seam as a vertex of its own: equal positions are one vertex.
 _SPLIT_FORMATS = (".stl", ".glb", ".gltf")
@@ -71,7 +73,7 @@ def read_mesh(path: Path, triangulate: bool = False) -> tuple[np.ndarray, np.nda
 
 
 def read_mesh_file(path: Path, split_polygons: bool = False) -> MeshFile:
-    """A mesh file (OBJ, PLY, OFF, STL, GLB, and the formats of plugins).
+    """A mesh file (OBJ, PLY, OFF, STL, GLB, USD, and the formats of plugins).
 
     Args:
         split_polygons: split faces of four and more corners (:func:`hood.mesh.editing.quality.triangulate`) instead of

@@ -64,3 +64,21 @@ def named_polygons(
     known = {name: np.array([name in combination for combination in combinations]) for name in names}
     short = folded_names(known)
     return {short[name]: mask[of_polygons] for name, mask in known.items()} or None, []
+
+
+def join_meshes(parts: list[RawMesh]) -> RawMesh:
+    """Several primitives as one mesh; what only some of them have is not kept, and noted."""
+    if len(parts) == 1:
+        return parts[0]
+    offsets = np.cumsum([0, *(len(part.pos) for part in parts)])
+    corners = np.concatenate([part.corners + offset for part, offset in zip(parts, offsets, strict=False)])
+    joined = RawMesh(np.concatenate([part.pos for part in parts]), corners, np.concatenate([part.counts for part in parts]))
+    for name, what in (("uv", "texture coordinates"), ("normals", "normals"), ("colours", "colours")):
+        tables = [getattr(part, name) for part in parts]
+        if all(table is not None for table in tables):
+            setattr(joined, name, np.concatenate(tables))
+        elif any(table is not None for table in tables):
+            joined.notes.append(f"only some parts have {what}; they are not kept")
+    joined.uv_corners = corners if joined.uv is not None else None
+    joined.normal_corners = corners if joined.normals is not None else None
+    return joined

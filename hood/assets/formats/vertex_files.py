@@ -1,6 +1,6 @@
 """Files that hold moving vertices: archives, HDF5, pickles, folders of numbered meshes; each reader for one format.
 
-Point caches (PC2) of Blender, Houdini and others: all positions of a mesh that lies beside them.
+Point caches (PC2, MDD) of Blender, Houdini and others: all positions of a mesh that lies beside them.
 """
 
 from __future__ import annotations
@@ -162,23 +162,28 @@ def _number(path: Path) -> tuple[list[int], str]:
     return [int(digits[-18:]) for digits in re.findall(r"\d+", path.stem)], path.name
 
 
-CACHE_SUFFIX = ".pc2"
+CACHE_SUFFIXES = (".pc2", ".mdd")
 _MAGIC = b"POINTCACHE2\0"
 #: Signature, version, points, first frame, frames from one sample to the next, samples.
 _HEADER = struct.Struct("<12siiffi")
+#: Of MDD, whose numbers begin with the largest byte: samples, points; the time [s] of each follows.
+_MDD_HEADER = struct.Struct(">ii")
 #: Frames per second of the scene, which the file does not hold.
 _SCENE_FPS = 30.0
+#: Samples of MDD that are farther apart [s] are numbered, not timed; and by how much [share] they may be uneven.
+_NUMBERED, _UNEVEN = 0.5, 0.05
 
 
 def caches(folder: Path) -> list[Path]:
     """The point caches in a folder, by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == CACHE_SUFFIX)
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in CACHE_SUFFIXES)
 
 
 def read_point_cache(path: Path) -> VertexFile:
-    """A PC2 file, or a folder that holds one; its faces are those of the OBJ or PLY of the same name, or of the only one there.
+    """A PC2 or MDD file, or a folder that holds one; its faces are those of the OBJ or PLY of the same name, or of the only one
+    there.
 
-    Samples are as far apart as the file says, at 30 frames a second of the scene.
+    Samples of PC2 are as far apart as the file says, at 30 frames a second of the scene; those of MDD have times.
 
     Raises:
         FileNotFoundError: no such file.
@@ -190,27 +195,58 @@ def read_point_cache(path: Path) -> VertexFile:
         if len(found) != 1:
             raise ValueError(f"{path}: holds {len(found)} point caches ({_listed(found)}); give the one that is meant")
         path = found[0]
+    verts, fps = (_read_mdd if path.suffix.lower() == ".mdd" else _read_pc2)(path)
+    mesh, points = _mesh_beside(path), verts.shape[1]
+    pos, faces = read_mesh(mesh, True)
+    if len(pos) != points:
+        raise ValueError(f"{path}: {points} points, {mesh.name} beside it has {len(pos)} vertices; write both from one mesh")
+    return VertexFile(verts.astype(np.float32), faces, fps)
+
+
+def _read_pc2(path: Path) -> tuple[np.ndarray, float]:
+    """Positions (N, W, 3) and frames per second."""
     with open(path, "rb") as file:
         head = file.read(_HEADER.size)
-        size = path.stat().st_size - _HEADER.size
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise ValueError(f"{path}: not a PC2 point cache: its first bytes are not POINTCACHE2; write it again")
         _, _, points, _, apart, samples = _HEADER.unpack(head)
         if points < 1 or samples < 1 or not (np.isfinite(apart) and apart > 0):
             raise ValueError(f"{path}: {samples} samples of {points} points, {apart:g} frames apart; write the cache again")
-        if size != 12 * points * samples:
-            raise ValueError(
-                f"{path}: {samples} samples of {points} points need {12 * points * samples} bytes, it holds {size}; it is cut "
-                "off or no PC2 file: write it again"
-            )
-        if size > SIZE_LIMIT:
-            raise ValueError(f"{path}: {size} bytes are more than {SIZE_LIMIT}; write fewer frames")
-        verts = np.frombuffer(file.read(size), "<f4").reshape(samples, points, 3)
-    mesh = _mesh_beside(path)
-    pos, faces = read_mesh(mesh, True)
-    if len(pos) != points:
-        raise ValueError(f"{path}: {points} points, {mesh.name} beside it has {len(pos)} vertices; write both from one mesh")
-    return VertexFile(verts.astype(np.float32), faces, _SCENE_FPS / apart)
+        _check_cache(path, samples, points, path.stat().st_size - _HEADER.size, 0)
+        return np.frombuffer(file.read(), "<f4").reshape(samples, points, 3), _SCENE_FPS / apart
+
+
+def _read_mdd(path: Path) -> tuple[np.ndarray, float | None]:
+    """The same; None where the file numbers its samples or holds one."""
+    with open(path, "rb") as file:
+        head = file.read(_MDD_HEADER.size)
+        samples, points = _MDD_HEADER.unpack(head) if len(head) == _MDD_HEADER.size else (0, 0)
+        if points < 1 or samples < 1:
+            raise ValueError(f"{path}: {samples} samples of {points} points; it is no MDD file: write the cache again")
+        _check_cache(path, samples, points, path.stat().st_size - _MDD_HEADER.size, 4 * samples)
+        times = np.frombuffer(file.read(4 * samples), ">f4").astype(np.float64)
+        verts = np.frombuffer(file.read(), ">f4").reshape(samples, points, 3)
+    if samples == 1:
+        return verts, None
+    steps, apart = np.diff(times), (times[-1] - times[0]) / (samples - 1)
+    if not (np.isfinite(times).all() and apart > 0 and np.abs(steps - apart).max() <= _UNEVEN * apart):
+        raise ValueError(
+            f"{path}: its samples are {steps.min():.3g} to {steps.max():.3g} s apart; write them at one frame rate"
+        )
+    return verts, None if apart > _NUMBERED else round(1.0 / apart, 3)
+
+
+def _check_cache(path: Path, samples: int, points: int, size: int, before: int) -> None:
+    """Refuse a cache whose ``size`` [bytes] behind its header is another than that of the positions and what is ``before``."""
+    needed = before + 12 * points * samples
+    if size != needed:
+        kind = path.suffix[1:].upper()
+        raise ValueError(
+            f"{path}: {samples} samples of {points} points need {needed} bytes, it holds {size}; it is cut off or no {kind} "
+            "file: write it again"
+        )
+    if size > SIZE_LIMIT:
+        raise ValueError(f"{path}: {size} bytes are more than {SIZE_LIMIT}; write fewer frames")
 
 
 def _mesh_beside(cache: Path) -> Path:

@@ -18,8 +18,9 @@ from hood.assets.files.text import parse_rate
 from hood.assets.formats import vertex_files
 from hood.assets.formats.gltf_animation import read_gltf_animation
 from hood.assets.formats.mesh_file import object_alone, read_mesh_file, split_object
+from hood.assets.formats.usd import USD_SUFFIXES, read_usd_animation
 from hood.assets.formats.vertex_files import (
-    CACHE_SUFFIX,
+    CACHE_SUFFIXES,
     FACE_KEYS,
     FOLDER_SUFFIXES,
     VERTEX_KEYS,
@@ -38,7 +39,7 @@ _STILL_SUFFIXES = (".obj", ".ply", ".off", ".stl")
 _GLTF_SUFFIXES = (".glb", ".gltf")
 _H5_SUFFIXES = (".h5", ".hdf5")
 #: What can be given as a moving or still mesh, besides a folder of OBJ or PLY files.
-ANIMATED_SUFFIXES = (".npz", ".pkl", CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES)
+ANIMATED_SUFFIXES = (".npz", ".pkl", *CACHE_SUFFIXES, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *USD_SUFFIXES, *_STILL_SUFFIXES)
 _DEFAULT_FPS = 30.0
 #: A body larger than this [m] is in other units. Of these [m per unit] that is named which brings it nearest to a person [m].
 _LARGEST, _UNITS, _USUAL = 30.0, (1.0, 0.01, 0.001), 1.7
@@ -105,9 +106,11 @@ def body_kind(name: str | Path) -> str:
     if (DATA_FOLDER / "body" / f"{name}.npz").is_file():
         return "model"
     if path.is_dir():
-        return "mesh" if any(entry.suffix.lower() in (*FOLDER_SUFFIXES, CACHE_SUFFIX) for entry in path.iterdir()) else "model"
+        return (
+            "mesh" if any(entry.suffix.lower() in (*FOLDER_SUFFIXES, *CACHE_SUFFIXES) for entry in path.iterdir()) else "model"
+        )
     suffix = path.suffix.lower()
-    if suffix in (CACHE_SUFFIX, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *_STILL_SUFFIXES):
+    if suffix in (*CACHE_SUFFIXES, *_H5_SUFFIXES, *_GLTF_SUFFIXES, *USD_SUFFIXES, *_STILL_SUFFIXES):
         return "mesh"
     if suffix in (".npz", ".pkl") and path.is_file():
         return "mesh" if _holds_vertices(path) else "model"
@@ -129,10 +132,11 @@ def load_mesh_sequence(
 ) -> MeshSequence:
     """A moving mesh at ``fps``: vertices move linearly between the frames of the file.
 
-    Accepted: a folder of numbered OBJ or PLY files; a PC2 point cache with its OBJ or PLY beside it, or their folder;
-    ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces`` (a ``rollout.h5`` as well); ``.glb`` or ``.gltf``,
-    whose animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still. A name behind that of a
-    still mesh or of glTF, ``scene.obj:Avatar``, is that of the object, group, material or part (``part_1``) that is the body.
+    Accepted: a folder of numbered OBJ or PLY files; a PC2 or MDD point cache with its OBJ or PLY beside it, or their folder;
+    ``.npz``, ``.h5`` or ``.pkl`` with ``verts (N, W, 3)`` and ``faces`` (a ``rollout.h5`` as well); glTF and USD, whose
+    animation is evaluated at ``fps`` itself; OBJ, PLY, OFF or STL for one that stands still. A name behind that of a
+    still mesh, of glTF or of USD, ``scene.obj:Avatar``, is that of the object, group, material or part (``part_1``) that is
+    the body.
 
     Args:
         up: axis that points up in the file: "y", "z", "x", "-y", "-z", "-x", or "auto", y, with a doubt where it seems to be z.
@@ -141,7 +145,7 @@ def load_mesh_sequence(
         file_fps: frame rate of the file, whatever it says itself; 30, with a doubt, where neither does.
         scale: metres per unit of the file; None: 1. Refused where the mesh is larger than 30 m then; a given one is warned of
             where it makes no person. 1 takes the mesh as it is.
-        animation, parts: of glTF, see :func:`hood.assets.formats.gltf_animation.read_gltf_animation`.
+        animation, parts: of glTF, see :func:`hood.assets.formats.gltf_animation.read_gltf_animation`; USD has ``parts``.
 
     Raises:
         FileNotFoundError: no such file or folder.
@@ -207,7 +211,7 @@ def _performed(
 
 def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], entry: str | None) -> VertexFile:
     suffix = path.suffix.lower()
-    if suffix == CACHE_SUFFIX or (path.is_dir() and caches(path)):
+    if suffix in CACHE_SUFFIXES or (path.is_dir() and caches(path)):
         return read_point_cache(path)
     if path.is_dir():
         return vertex_files.read_mesh_folder(path)
@@ -216,6 +220,8 @@ def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], en
         skinned = scene.transforms is not None
         rest = scene.rest if skinned else None
         return VertexFile(scene.verts, scene.faces, fps, scene.transforms, rest, scene.weights, scene.joints)
+    if suffix in USD_SUFFIXES:
+        return VertexFile(*read_usd_animation(path, fps, parts if entry is None else (entry,)), fps)
     if suffix in _STILL_SUFFIXES:
         mesh = read_mesh_file(path, True)
         mesh = mesh if entry is None else object_alone(path, mesh, entry)

@@ -2,7 +2,7 @@
 
 glTF 2.0, binary: every frame a morph target, and an animation that goes from one to the next.
 
-USD: one prim a part, positions and normals as time samples, and images beside the file.
+USD: one prim a part; positions, normals and velocities as time samples; images beside the file.
 """
 
 from __future__ import annotations
@@ -25,20 +25,25 @@ _LARGEST = 256 * 2**20
 _FLOAT, _UNSIGNED = 5126, 5125
 
 
-def estimated_size(clip: Clip) -> int:
+def estimated_size(clip: Clip, velocities: bool = False) -> int:
     """Bytes of the file, about."""
     weights = 4 * clip.num_frames**2 * len(clip.parts)
     images = sum(len(texture.content) for texture in _images(clip))
-    return images + weights + sum(24 * clip.num_frames * len(_corners(part)[0]) for part in clip.parts)
+    row = 36 if velocities else 24
+    return images + weights + sum(row * clip.num_frames * len(_corners(part)[0]) for part in clip.parts)
 
 
-def gltf_bytes(clip: Clip) -> bytes:
+def gltf_bytes(clip: Clip, velocities: bool = False) -> bytes:
     """The file. Axes, units and origin: y up, metres; the origin is the translation of the nodes.
+
+    Args:
+        velocities: of every vertex [m/s] as well, the attribute ``_VELOCITY`` with its morph targets: like positions, those of
+            a frame are the attribute and the frame's target together.
 
     Raises:
         ValueError: above :data:`_LARGEST`.
     """
-    size = estimated_size(clip)
+    size = estimated_size(clip, velocities)
     if size > _LARGEST:
         raise ValueError(
             f"as glb it would have {size / 2**20:.0f} MiB, more than the {_LARGEST // 2**20} that programs open with ease; "
@@ -52,7 +57,7 @@ def gltf_bytes(clip: Clip) -> bytes:
     nodes, meshes, materials, samplers, channels = [], [], [], list[dict[str, Any]](), list[dict[str, Any]]()
     images = _images(clip)
     for index, part in enumerate(clip.parts):
-        meshes.append(_mesh(file, part, index))
+        meshes.append(_mesh(file, part, index, clip.fps if velocities else None))
         linear = [*(float(channel) ** 2.2 for channel in part.colour), 1.0]
         surface: dict[str, Any] = {"baseColorFactor": linear, "metallicFactor": 0.0, "roughnessFactor": part.roughness}
         if part.texture is not None:
@@ -79,18 +84,24 @@ def gltf_bytes(clip: Clip) -> bytes:
     return _packed(json.dumps(document).encode(), b"".join(file.chunks))
 
 
-def _mesh(file: _Buffers, part: ClipPart, material: int) -> dict[str, Any]:
+def _mesh(file: _Buffers, part: ClipPart, material: int, fps: float | None) -> dict[str, Any]:
+    """Of a rate ``fps`` with velocities."""
     corners, faces, uv = _corners(part)
     base, normals = part.pos[0][corners].astype(np.float32), part.normals(0)[corners].astype(np.float32)
     attributes = {"POSITION": file.add(base, "VEC3", bounds=True), "NORMAL": file.add(normals, "VEC3")}
     if uv is not None:
         turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)  # an image begins at its top here
         attributes["TEXCOORD_0"] = file.add(turned.astype(np.float32), "VEC2")
-    targets = []
+    targets: list[dict[str, int]] = []
+    speed = None if fps is None else part.velocities(0, fps)[corners].astype(np.float32)
+    if speed is not None:
+        attributes["_VELOCITY"] = file.add(speed, "VEC3")
     for frame in range(1, len(part.pos)):
         moved = (part.pos[frame][corners] - base).astype(np.float32)
         turn = part.normals(frame)[corners].astype(np.float32) - normals
         targets.append({"POSITION": file.add(moved, "VEC3", bounds=True), "NORMAL": file.add(turn, "VEC3")})
+        if fps is not None:
+            targets[-1]["_VELOCITY"] = file.add(part.velocities(frame, fps)[corners].astype(np.float32) - speed, "VEC3")
     indices = file.add(faces.astype(np.uint32).reshape(-1), "SCALAR")
     primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": material}
     mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
@@ -206,14 +217,15 @@ def _write_stage(path: Path, clip: Clip, up: str, name: str) -> None:
     if clip.origin.any():
         root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, clip.origin)))
     for part in clip.parts:
-        _add_prim(UsdGeom.Mesh.Define(stage, f"/rollout/{part.name}"), part, UsdGeom, Vt)
+        _add_prim(UsdGeom.Mesh.Define(stage, f"/rollout/{part.name}"), part, clip.fps, UsdGeom, Vt)
     for part in clip.parts:
         if part.texture is not None:
             _bind_image(stage, clip, part.name, image_name(name, part))
     stage.GetRootLayer().Save()
 
 
-def _add_prim(mesh: Any, part: ClipPart, geom: Any, vt: Any) -> None:
+def _add_prim(mesh: Any, part: ClipPart, fps: float, geom: Any, vt: Any) -> None:
+    """Velocities are per second, not per time code, as the schema says; a still mesh has none."""
     mesh.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(part.faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(np.ascontiguousarray(part.faces.reshape(-1), np.int32)))
     mesh.CreateSubdivisionSchemeAttr(geom.Tokens.none)
@@ -228,10 +240,13 @@ def _add_prim(mesh: Any, part: ClipPart, geom: Any, vt: Any) -> None:
         texture.SetIndices(vt.IntArray.FromNumpy(np.ascontiguousarray(part.uv_faces.reshape(-1), np.int32)))
     points, normals, extent = mesh.CreatePointsAttr(), mesh.CreateNormalsAttr(), mesh.CreateExtentAttr()
     mesh.SetNormalsInterpolation(geom.Tokens.vertex)
+    velocities = mesh.CreateVelocitiesAttr() if len(part.pos) > 1 else None
     for frame, pos in enumerate(part.pos):
         here = np.ascontiguousarray(pos, np.float32)
         points.Set(vt.Vec3fArray.FromNumpy(here), frame)
         normals.Set(vt.Vec3fArray.FromNumpy(np.ascontiguousarray(part.normals(frame), np.float32)), frame)
+        if velocities is not None:
+            velocities.Set(vt.Vec3fArray.FromNumpy(np.ascontiguousarray(part.velocities(frame, fps), np.float32)), frame)
         extent.Set(vt.Vec3fArray.FromNumpy(np.stack([here.min(axis=0), here.max(axis=0)])), frame)
 
 

@@ -1,5 +1,5 @@
 """Meshes for other programs: OBJ files with the texture coordinates and hard edges of the garment, a mesh file a frame
-(OBJ, PLY), and one mesh with a point cache (OBJ and PC2).
+(OBJ, PLY), and one mesh with a point cache (OBJ and PC2 or MDD).
 
 Moving meshes as other programs know them: named parts, a frame rate, one origin.
 """
@@ -94,6 +94,16 @@ def write_point_cache(folder: Path, clip: Clip) -> None:
         # Version, points, first frame, frames from one sample to the next, samples.
         header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, part.pos.shape[1], 0.0, 1.0, clip.num_frames)
         (folder / f"{part.name}.pc2").write_bytes(header + np.ascontiguousarray(part.pos, "<f4").tobytes())
+
+
+def write_mdd(folder: Path, clip: Clip) -> None:
+    """The same as ``NAME.mdd``: numbers begin with their largest byte, and every frame has a time [s]."""
+    times = np.arange(clip.num_frames) / clip.fps
+    for part in clip.parts:
+        (folder / f"{part.name}.obj").write_text(_obj_points(part, 0) + _obj_faces(folder, part), encoding="ascii")
+        header = struct.pack(">ii", clip.num_frames, part.pos.shape[1])
+        content = (times.astype(">f4").tobytes(), np.ascontiguousarray(part.pos, ">f4").tobytes())
+        (folder / f"{part.name}.mdd").write_bytes(header + b"".join(content))
 
 
 #: Where the head of a point cache says how many frames there are.
@@ -197,6 +207,11 @@ class ClipPart:
     texture: Texture | None = None
     roughness: float = 0.9  # 0 to 1
     layers: np.ndarray | None = None  # (V, 2) m, distances of both sides of the shell that it is to be; None: it stays a sheet
+
+    def velocities(self, frame: int, fps: float) -> np.ndarray:
+        """(V, 3) m/s of one frame: central differences, one-sided in the first and the last."""
+        before, after = max(frame - 1, 0), min(frame + 1, len(self.pos) - 1)
+        return (self.pos[after] - self.pos[before]) * (fps / max(after - before, 1))
 
     def normals(self, frame: int) -> np.ndarray:
         """Unit normals (V, 3) of one frame; of vertices without a face, or with faces of no area, any."""

@@ -10,7 +10,7 @@ from hood.assets.files.library import locate
 from hood.assets.identify import identify
 from hood.assets.motion.animated_mesh import body_kind
 
-FOREIGN = ("usd", "usda", "usdc", "usdz", "fbx", "bvh", "abc", "dae", "blend", "max", "mb", "ma")
+FOREIGN = ("fbx", "bvh", "dae", "blend", "max", "mb", "ma")
 
 
 @pytest.mark.parametrize("suffix", [*FOREIGN, "FBX"])
@@ -23,6 +23,14 @@ def test_each_names_the_way_out(tmp_path: Path, suffix: str) -> None:
             locate(kind, path)
     with pytest.raises(ValueError, match=r"files are not read; .*GLB"):
         identify(str(path))
+
+
+def test_alembic_comes_in_as_usd(tmp_path: Path) -> None:
+    path = tmp_path / "hero.abc"
+    path.write_bytes(b"content")
+    for kind in ("garments", "motions", "body"):
+        with pytest.raises(ValueError, match=r"hero\.abc: Alembic files are not read; .*export USD, .* give hero\.usd"):
+            locate(kind, path)
 
 
 @pytest.mark.parametrize("suffix", ["c3d", "trc"])

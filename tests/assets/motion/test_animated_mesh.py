@@ -139,6 +139,43 @@ def test_a_point_cache_moves_the_mesh_beside_it(tmp_path: Path) -> None:
     assert load_mesh_sequence(path, 30.0).num_frames == 2 * COUNT - 1
 
 
+def write_mdd(path: Path, times: np.ndarray, verts: np.ndarray) -> Path:
+    write_obj(path.with_suffix(".obj"), POINTS, FACES)
+    head = struct.pack(">ii", len(verts), len(POINTS))
+    path.write_bytes(head + times.astype(">f4").tobytes() + verts.astype(">f4").tobytes())
+    return path
+
+
+def test_an_mdd_cache_has_times(tmp_path: Path) -> None:
+    times = 2.0 + np.arange(COUNT) / 24.0
+    path = write_mdd(tmp_path / "walk.mdd", times, moving())
+    for given in (path, tmp_path):
+        assert body_kind(given) == "mesh"
+        found = load_mesh_sequence(given, 24.0)
+        np.testing.assert_array_equal(found.faces, FACES)
+        np.testing.assert_array_equal(found.verts, moving().astype(np.float32))
+    write_mdd(path, np.arange(COUNT), moving())  # frames, no seconds
+    with pytest.warns(UserWarning, match="says no frame rate, 30 fps are assumed"):
+        assert load_mesh_sequence(path, 30.0).num_frames == COUNT
+    assert load_mesh_sequence(write_mdd(path, times[:1], moving()[:1])).num_frames == 1
+
+
+def test_an_mdd_cache_that_is_none_is_refused(tmp_path: Path) -> None:
+    times = np.arange(COUNT) / 24.0
+    path = write_mdd(tmp_path / "walk.mdd", times, moving())
+    content = path.read_bytes()
+    late = np.where(np.arange(COUNT) > 2, times + 1.0, times).astype(">f4").tobytes()
+    for damaged, said in (
+        (content[:-5], "cut off or no MDD file"),
+        (content[:6], "0 samples of 0 points; it is no MDD file"),
+        (struct.pack("<ii", COUNT, len(POINTS)) + content[8:], "MDD file"),
+        (content[:8] + late + content[8 + 4 * COUNT :], "its samples are 0.0417 to 1.04 s apart; write them at one frame rate"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=rf"walk\.mdd: .*{said}"):
+            load_mesh_sequence(path)
+
+
 def test_a_point_cache_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     path = write_cache(tmp_path / "walk.pc2")
     content = path.read_bytes()
