@@ -28,6 +28,7 @@ from hood.assets.files.library import locate
 from hood.cli.compare import short_names
 from hood.rollouts.file.dataset import RolloutDataset
 from hood.rollouts.file.reader import RolloutData, published_bytes, read_published, read_rollout, write_rollout
+from hood.rollouts.verdict.rule import judge_rollout
 from hood.steppers.checkpoint import CAUTION, load_simulator, read_header, save_simulator
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 
@@ -114,12 +115,14 @@ def view(arguments: Sequence[str]) -> int:
     if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
         raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
     textures = read_textures(config)
-    rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
+    whole = [read_checked(path, "fabric") for path in files]
+    rollouts = [_first_frames(data, count) for data in whole]
     from hood.media.viewer.page import view_page
 
     names = short_names(files)
     title = " and ".join(names) if config.title is None else str(config.title)
-    page = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts)).encode()
+    named = list(zip(names, rollouts, strict=True))
+    page = view_page(named, title, lay_on(textures, rollouts), [judge_rollout(data) for data in whole]).encode()
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, page)
     frames = max(len(data.time) for data in rollouts)

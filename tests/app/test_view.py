@@ -63,8 +63,8 @@ def test_the_page_holds_the_rollout() -> None:
         assert np.abs(unpack_positions(packed) - pos).max() <= 1e-4
         assert unpack_integers(packed["faces"]).reshape(-1, 3).tolist() == faces.tolist()
     strain, contact = held["scales"]
-    assert (strain["name"], strain["low"], strain["high"], contact["name"]) == ("strain", "0%", "50%", "contact")
-    shown = np.frombuffer(unpack_bytes(only["values"]["strain"]), np.uint8).reshape(4, -1) / 254 * 0.5
+    assert (strain["name"], strain["low"], strain["high"], contact["name"]) == ("strain", 0.0, 0.5, "contact")
+    shown = np.array(strain["levels"])[np.frombuffer(unpack_bytes(only["values"]["strain"]), np.uint8).reshape(4, -1)]
     assert np.allclose(shown, 0.1 * np.arange(4)[:, None], atol=0.002)
     assert len(held["ramp"]) == 256
     assert only["figures"][0] == {"name": "strain_p99", "title": "strain p99", "values": [0.0, 0.1, 0.2, 0.3]}
