@@ -59,8 +59,8 @@ export const isSameMesh = (one, other) => one.width === other.width && one.faces
 function apart(mesh, other, frame, at) {
   const i = Math.min(frame, mesh.frames - 1) * mesh.width + 3 * at;
   const j = Math.min(frame, other.frames - 1) * other.width + 3 * at;
-  const [one, two] = [mesh.whole, other.whole];
-  return mesh.step * Math.hypot(one[i] - two[j], one[i + 1] - two[j + 1], one[i + 2] - two[j + 2]);
+  const x = mesh.whole[i] - other.whole[j], y = mesh.whole[i + 1] - other.whole[j + 1], z = mesh.whole[i + 2] - other.whole[j + 2];
+  return mesh.step * Math.sqrt(x * x + y * y + z * z);
 }
 
 /** The scale of the distance of meshes from the `first`, over all frames: its high end holds 99.5 % of the values. */
@@ -73,11 +73,11 @@ export function differenceScale(first, meshes) {
       for (let at = frame % stride; at < mesh.width / 3; at += stride) found.push(apart(first, mesh, frame, at));
     }
   }
-  found.sort((a, b) => a - b);
-  const usual = Math.max(found[Math.floor(0.995 * (found.length - 1))] ?? 0, 1e-3);
+  const sorted = Float32Array.from(found).sort();
+  const usual = Math.max(sorted[Math.floor(0.995 * (sorted.length - 1))] ?? 0, 1e-3);
   const power = 10 ** Math.floor(Math.log10(usual));
   const high = [1, 2, 5, 10].find((step) => step * power >= usual * (1 - 1e-9)) * power;
-  const most = Math.max(high, found[found.length - 1] ?? 0);
+  const most = Math.max(high, sorted[sorted.length - 1] ?? 0);
   const levels = Array.from({ length: UNKNOWN }, (_, code) => most * (code / (UNKNOWN - 1)) ** 2);
   return { name: 'difference', label: 'difference', title: 'distance from the first rollout', times: 1e3, unit: 'mm',
     low: 0, high, fixed: [0, 0.02], logarithmic: false, levels };

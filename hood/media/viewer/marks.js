@@ -22,7 +22,7 @@ function buttonOf(mark, seconds, go, whole) {
   button.type = 'button';
   button.className = mark.kind;
   button.title = `${mark.title || mark.words} (${whenOf(mark, seconds)})`;
-  button.ariaLabel = `${mark.kind}: ${mark.words}, ${whenOf(mark, seconds)}`;
+  if (!whole) button.ariaLabel = `${mark.kind}: ${mark.words}, ${whenOf(mark, seconds)}`;
   button.append(sign, name);
   button.onclick = () => go(mark.frame);
   return button;

@@ -69,7 +69,9 @@ def marks_of(data: RolloutData, verdict: Verdict | None = None) -> list[Mark]:
         mine = {int(alarm["frame"]): alarm for alarm in data.alarms if str(alarm["cause"]) == cause}
         for first, last in _joined(sorted(mine), len(data.time)):
             worst = max((mine[frame] for frame in mine if first <= frame <= last), key=lambda alarm: float(alarm["value"]))
-            title = f"guard: {cause}, {worst['value']:.3g} in frame {worst['frame']} (limit {worst['limit']:.3g})"
+            told = f"{cause}, {worst['value']:.3g}" if np.isfinite(worst["value"]) else cause
+            limit = f" (limit {worst['limit']:.3g})" if np.isfinite(worst["limit"]) else ""
+            title = f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}"
             found.append(Mark(_stored(data, first), _stored(data, last), "alarm", cause, title))
     for reason in () if verdict is None or verdict.sound is not False else verdict.reasons:
         for first, last in reason.frames:
@@ -288,11 +290,11 @@ def _lowest(data: RolloutData) -> float:
 def _levels(colourings: Sequence[Colouring]) -> np.ndarray:
     """Places (255,) on a scale, rising, one a code: evenly from 0 to 1 between its ends, and ever wider apart beyond them.
 
-    They go as far as there are values; of a logarithmic scale at most its length below and three of them above.
+    They go as far as there are values: at most 1,000 lengths of the scale, of a logarithmic one a length below and three above.
     """
-    farthest = (-1.0, 4.0) if colourings[0].logarithmic else (-np.inf, np.inf)
+    farthest = (-1.0, 4.0) if colourings[0].logarithmic else (-1e3, 1e3)
     place = np.concatenate([_place(one).ravel() for one in colourings])
-    place = np.clip(place[np.isfinite(place)], *farthest)
+    place = np.clip(place[~np.isnan(place)], *farthest)
     low, high = float(place.min(initial=0.0)), float(place.max(initial=1.0))
     below, above = (_BELOW if low < 0 else 0), (_ABOVE if high > 1 else 0)
     return np.concatenate(
