@@ -5,7 +5,7 @@ Colours that tell the garments of an outfit apart, how fabrics look, and how thi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -178,6 +178,26 @@ def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.
         name = name if name not in [other.name for other in found] else f"{name}_{rank}"
         found.append(GarmentPiece(name, np.flatnonzero(piece == label), mine, uv, None if uv_faces is None else uv_faces[mine]))
     return found
+
+
+def parts_of(data: RolloutData, pieces: Sequence[GarmentPiece]) -> tuple[list[str], np.ndarray]:
+    """Names of the parts of the cloth, and the part (F,) of every face: garments, and within them their fabrics and what rides
+    on them, as buttons and pockets."""
+    count, (_, riding), faces = len(data.cloth_faces), data.riding, data.cloth_faces
+    garment, fabric = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    for rank, piece in enumerate(pieces):
+        garment[piece.faces] = rank
+    words, own = str(data.attributes.get("fabric_names", "")).split("+"), data.still.get("fabric")
+    if own is not None and own.shape == data.cloth_pos.shape[1:2] and 0 <= own.min() <= own.max() < len(words):
+        fabric = own[faces].min(axis=1)
+    kinds = np.stack([garment, fabric, np.arange(count) >= count - riding], axis=1)
+    rows, part = np.unique(kinds, axis=0, return_inverse=True)
+    several = {rank for rank in rows[:, 0].tolist() if len(set(rows[rows[:, 0] == rank, 1].tolist())) > 1}
+    names = [
+        pieces[rank].name + (f", {words[kind]}" if rank in several else "") + (", pockets and buttons" if rides else "")
+        for rank, kind, rides in rows.tolist()
+    ]
+    return names, part.reshape(-1)
 
 
 def split_seams(faces: np.ndarray, uv_faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

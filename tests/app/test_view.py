@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 from hood.cli.main import main
-from hood.media.viewer.page import unpack_bytes, unpack_integers, unpack_positions
+from hood.media.colouring import Colouring
+from hood.media.viewer.page import _codes, _levels, unpack_bytes, unpack_integers, unpack_positions
 from hood.rollouts.file.reader import read_rollout
 from hood.rollouts.file.recorder import RolloutWriter
 from hood.testing import cylinder, sphere
@@ -63,13 +65,52 @@ def test_the_page_holds_the_rollout() -> None:
         assert np.abs(unpack_positions(packed) - pos).max() <= 1e-4
         assert unpack_integers(packed["faces"]).reshape(-1, 3).tolist() == faces.tolist()
     strain, contact = held["scales"]
-    assert (strain["name"], strain["low"], strain["high"], contact["name"]) == ("strain", "0%", "50%", "contact")
-    shown = np.frombuffer(unpack_bytes(only["values"]["strain"]), np.uint8).reshape(4, -1) / 254 * 0.5
+    assert (strain["name"], strain["low"], strain["high"], contact["name"]) == ("strain", 0.0, 0.5, "contact")
+    shown = np.array(strain["levels"])[np.frombuffer(unpack_bytes(only["values"]["strain"]), np.uint8).reshape(4, -1)]
     assert np.allclose(shown, 0.1 * np.arange(4)[:, None], atol=0.002)
     assert len(held["ramp"]) == 256
     assert only["figures"][0] == {"name": "strain_p99", "title": "strain p99", "values": [0.0, 0.1, 0.2, 0.3]}
     assert only["figures"][1]["values"] == [None, 40.0, 40.0, 40.0]
     assert held["seconds"] == pytest.approx(1 / 30)
+
+
+def test_values_beyond_the_scale_keep_their_order_and_size() -> None:
+    """A strain of 300% at one vertex in 500 does not stretch the scale of 20%, and is told from one of 60%."""
+    values = np.full((10, 500), 0.15)
+    values[3, 7], values[4, 7] = 3.0, 0.6
+    colouring = Colouring(values, 0.0, 0.2, False, "strain", ((0.0, "0%"), (0.2, "20%")))
+    levels = _levels([colouring, replace(colouring, values=values / 2)])
+    held = 0.2 * levels[_codes(colouring, levels)]
+    assert (len(levels), levels.min()) == (255, 0.0)
+    assert (np.diff(levels) > 0).all()
+    assert np.allclose(held, values, rtol=0.06, atol=0.001)
+    assert held[3, 7] == pytest.approx(3.0)
+
+
+def test_distances_before_a_falling_scale_and_values_that_are_missing() -> None:
+    values = np.array([[0.5, 0.02, 0.01, 0.0, np.nan]])
+    colouring = Colouring(values, 0.02, 0.0, False, "distance from the body", ((0.02, "20 mm"), (0.0, "0 mm")))
+    codes = _codes(colouring, levels := _levels([colouring]))
+    assert np.allclose(0.02 - 0.02 * levels[codes[0, :4]], values[0, :4], atol=5e-5)
+    assert codes[0, 4] == 255
+
+
+def test_forces_far_from_a_logarithmic_scale_are_held_at_its_ends() -> None:
+    values = np.array([[0.0, 1e-2, 1.0, 1e30]])
+    colouring = Colouring(values, 1e-4, 1.0, True, "force", ((1e-4, "0.0001"), (1.0, "1")))
+    levels = _levels([colouring])
+    found = 1e-4 * 1e4 ** levels[_codes(colouring, levels)]
+    assert np.allclose(found, [[1e-8, 1e-2, 1.0, 1e12]], rtol=0.05)
+
+
+def test_frames_that_the_verdict_names_are_marked() -> None:
+    path = record("run/rollout.h5", frames=8)
+    with h5py.File(path, "r+") as file:
+        file["cloth/pos"][2:4, 5] = np.nan
+    assert main(["view", "run", "output=page.html"]) == 0
+    marks = content(Path("page.html").read_text())["moments"]
+    found = [(mark["frame"], mark["last"]) for mark in marks if (mark["kind"], mark["words"]) == ("unsound", "not finite")]
+    assert found == [(2, 3)]
 
 
 def test_the_page_loads_nothing_and_names_cannot_break_it() -> None:

@@ -14,6 +14,7 @@ from hood.app.output.export import lay_on, read_checked, read_textures
 from hood.app.settings.compose import ConfigError
 from hood.assets.files.atomic import write_atomically
 from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.verdict.rule import judge_rollout
 
 #: More would be too narrow to see anything.
 _MOST = 4
@@ -58,12 +59,14 @@ def viewer_page(arguments: Sequence[str]) -> Page:
     if target.suffix.lower() not in (".html", ".htm") or target.is_dir():
         raise ConfigError(f"output={target}: name a file that ends in .html, e.g. output=view.html")
     textures = read_textures(config)
-    rollouts = [_first_frames(read_checked(path, "fabric"), count) for path in files]
+    whole = [read_checked(path, "fabric") for path in files]
+    rollouts = [_first_frames(data, count) for data in whole]
     from hood.media.viewer.page import view_page
 
     names = short_names(files)
     title = " and ".join(names) if config.title is None else str(config.title)
-    text = view_page(list(zip(names, rollouts, strict=True)), title, lay_on(textures, rollouts))
+    named = list(zip(names, rollouts, strict=True))
+    text = view_page(named, title, lay_on(textures, rollouts), [judge_rollout(data) for data in whole])
     most = max(max(data.cloth_pos.shape[1], data.body_pos.shape[1]) for data in rollouts)
     return Page(text, target, max(len(data.time) for data in rollouts), most)
 

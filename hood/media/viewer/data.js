@@ -1,4 +1,4 @@
-// What the page holds, unpacked: the counterpart of packing.py.
+// What the page holds, unpacked: the counterpart of page.py.
 
 /** Bytes of deflated base64 text. */
 export async function unpackBytes(text) {

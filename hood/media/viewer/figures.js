@@ -1,7 +1,8 @@
 // The chart under the timeline: one figure of every rollout over the frames.
 
-const COLOURS = ['#3b6fb6', '#c9702f', '#4c8452', '#9e476b'];
-const MARGIN = { left: 60, right: 12, top: 14, bottom: 6 };
+import { INKS } from 'colours';
+
+const MARGIN = { left: 60, right: 12, top: 8, bottom: 6 };
 const GAP = 4; // pixels between two labels
 
 /** Titles of the figures that any rollout has, by their names. */
@@ -27,10 +28,10 @@ export function rowsOf(lefts, widths) {
   });
 }
 
-/** Draw the figure `name`, with a line at `frame` of `frames` and broken ones at the `moments` of events. */
-export function drawChart(canvas, rollouts, name, frame, frames, moments = []) {
+/** Draw the figure `name`, with a line at `frame` of `frames` and broken ones at the `moments`, in the colours of their kinds. */
+export function drawChart(canvas, rollouts, name, frame, frames, moments, kinds) {
   const pen = prepare(canvas);
-  const series = rollouts.map((rollout) => rollout.figures.find((figure) => figure.name === name)?.values ?? []);
+  const series = rollouts.map((rollout) => figureOf(rollout, name));
   const top = Math.max(1e-12, ...series.flat().filter((value) => value !== null));
   const height = canvas.clientHeight - MARGIN.top - MARGIN.bottom;
   const x = (at) => placeOf(canvas.clientWidth, at, frames);
@@ -40,11 +41,27 @@ export function drawChart(canvas, rollouts, name, frame, frames, moments = []) {
   pen.textAlign = 'right';
   pen.fillText(shown(name, top), MARGIN.left - 4, MARGIN.top + 4);
   pen.fillText('0', MARGIN.left - 4, MARGIN.top + height);
-  for (const moment of moments) drawMoment(pen, x(moment.frame), height);
-  series.forEach((values, at) => drawLine(pen, values, x, y, COLOURS[at % COLOURS.length]));
+  for (const moment of moments) drawMoment(pen, x(moment.frame), x(moment.last), height, kinds[moment.kind][1]);
+  series.forEach((values, at) => drawLine(pen, values, x, y, INKS[at % INKS.length]));
   pen.fillStyle = '#0006';
   pen.fillRect(x(frame), MARGIN.top, 1.5, height);
-  series.forEach((values, at) => drawValue(pen, name, rollouts[at].name, values[frame], at));
+}
+
+const figureOf = (rollout, name) => rollout.figures.find((figure) => figure.name === name)?.values ?? [];
+
+/** The values of a frame in the colours of their lines, as the children of `legend`. */
+export function tellValues(legend, rollouts, name, frame) {
+  if (legend.children.length !== rollouts.length) {
+    legend.replaceChildren(...rollouts.map((_, at) => {
+      const line = document.createElement('span');
+      line.style.color = INKS[at % INKS.length];
+      return line;
+    }));
+  }
+  rollouts.forEach((rollout, at) => {
+    const value = figureOf(rollout, name)[frame] ?? null;
+    legend.children[at].textContent = `${rollout.name}: ${value === null ? '–' : shown(name, value)}`;
+  });
 }
 
 /** The frame under a place of the chart, which is `offset` pixels from its left side. */
@@ -74,22 +91,17 @@ function drawLine(pen, values, x, y, colour) {
   pen.stroke();
 }
 
-function drawMoment(pen, x, height) {
-  pen.strokeStyle = '#7a4fa3';
+function drawMoment(pen, first, last, height, colour) {
+  pen.fillStyle = `${colour}22`;
+  pen.fillRect(first, MARGIN.top, last - first, height);
+  pen.strokeStyle = colour;
   pen.lineWidth = 1;
   pen.setLineDash([3, 3]);
   pen.beginPath();
-  pen.moveTo(x, MARGIN.top);
-  pen.lineTo(x, MARGIN.top + height);
+  pen.moveTo(first, MARGIN.top);
+  pen.lineTo(first, MARGIN.top + height);
   pen.stroke();
   pen.setLineDash([]);
-}
-
-function drawValue(pen, name, title, value, at) {
-  pen.textAlign = 'left';
-  pen.fillStyle = COLOURS[at % COLOURS.length];
-  const text = value === undefined || value === null ? '–' : shown(name, value);
-  pen.fillText(`${title}: ${text}`, MARGIN.left + 8 + at * 220, 10);
 }
 
 function shown(name, value) {

@@ -12,6 +12,7 @@ import html
 import json
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ import numpy as np
 from hood.assets.formats.image import Texture
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
-from hood.media.pieces import looks_of, pieces_of, split_seams
+from hood.media.pieces import looks_of, parts_of, pieces_of, split_seams
 from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.verdict.rule import Verdict
 from hood.scene.holding import first_step
 
 _ACTIONS = ("open", "close", "detach", "attach")
@@ -40,22 +42,81 @@ def moments_of(data: RolloutData) -> list[tuple[int, str]]:
     for event in (_settings(data).get("events") or []) if dt > 0 else []:
         action = next(action for action in _ACTIONS if action in event)
         frame = int(event["frame"]) if "frame" in event else first_step(float(event["time"]), step)
-        frame = frame if rate is None else ceil(frame / rate.stride)
+        frame = _stored(data, frame)
         if frame < len(data.time) - 1:
             found.append((frame, f"{action} {_names(event[action])}"))
     return sorted(found, key=lambda moment: moment[0])
 
 
-def shared_moments(rollouts: Sequence[tuple[str, RolloutData]]) -> list[tuple[int, str]]:
-    """Those of several named rollouts; where not all have one, with the names of those that do."""
-    by_moment: dict[tuple[int, str], list[str]] = {}
-    for name, data in rollouts:
-        for moment in dict.fromkeys(moments_of(data)):
-            by_moment.setdefault(moment, []).append(name)
+@dataclass(frozen=True)
+class Mark:
+    """Frames that the time line marks, in words."""
+
+    frame: int
+    last: int
+    kind: str  # event, alarm (of the guard), unsound or doubt (of the verdict)
+    words: str
+    title: str = ""  # the whole sentence, where the words are only its beginning
+
+
+def marks_of(data: RolloutData, verdict: Verdict | None = None) -> list[Mark]:
+    """Events, alarms of the guard, and what the ``verdict`` says of frames, by frame; frames that are not there are left out.
+
+    Alarms of one cause that lie close together are one mark, with the worst value. A doubt without frames is marked at 0.
+    """
+    found = [Mark(frame, frame, "event", words) for frame, words in moments_of(data)]
+    for cause in dict.fromkeys(str(alarm["cause"]) for alarm in data.alarms):
+        mine = {int(alarm["frame"]): alarm for alarm in data.alarms if str(alarm["cause"]) == cause}
+        for first, last in _joined(sorted(mine), len(data.time)):
+            worst = max((mine[frame] for frame in mine if first <= frame <= last), key=lambda alarm: float(alarm["value"]))
+            told = f"{cause}, {worst['value']:.3g}" if np.isfinite(worst["value"]) else cause
+            limit = f" (limit {worst['limit']:.3g})" if np.isfinite(worst["limit"]) else ""
+            title = f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}"
+            found.append(Mark(_stored(data, first), _stored(data, last), "alarm", cause, title))
+    for reason in () if verdict is None or verdict.sound is not False else verdict.reasons:
+        for first, last in reason.frames:
+            name = reason.kind.replace("_", " ")
+            found.append(Mark(_stored(data, first), _stored(data, last), "unsound", name, f"unsound: {reason.sentence}"))
+    for doubt in () if verdict is None else verdict.doubts:
+        for first, last in _joined(sorted(doubt["frames"]), len(data.time)) or [(0, 0)]:
+            name, title = str(doubt["kind"]).replace("_", " "), f"doubt: {doubt['sentence']}"
+            found.append(Mark(_stored(data, first), _stored(data, last), "doubt", name, title))
+    there = (replace(mark, last=min(mark.last, len(data.time) - 1)) for mark in found if 0 <= mark.frame < len(data.time))
+    return sorted(there, key=lambda mark: (mark.frame, mark.last))
+
+
+def shared_marks(
+    rollouts: Sequence[tuple[str, RolloutData]], verdicts: Sequence[Verdict] | None = None
+) -> list[dict[str, Any]]:
+    """Those of several named rollouts as JSON; where not all have one, with the names of those that do."""
+    by_mark: dict[Mark, list[str]] = {}
+    for (name, data), verdict in zip(rollouts, verdicts or [None] * len(rollouts), strict=True):
+        for mark in dict.fromkeys(marks_of(data, verdict)):
+            by_mark.setdefault(mark, []).append(name)
     return [
-        (frame, words if len(names) == len(rollouts) else f"{words} ({', '.join(names)})")
-        for (frame, words), names in sorted(by_moment.items())
+        asdict(mark) | ({} if len(names) == len(rollouts) else {"words": f"{mark.words} ({', '.join(names)})"})
+        for mark, names in sorted(by_mark.items(), key=lambda item: (item[0].frame, item[0].last))
     ]
+
+
+def _stored(data: RolloutData, frame: int) -> int:
+    """The first stored frame that is no earlier than a simulated one."""
+    return frame if data.steps is None else ceil(frame / data.steps.rate.stride)
+
+
+#: Marks of one kind that are nearer than this share of all frames are one: they would cover each other.
+_NEAR = 1 / 60
+
+
+def _joined(frames: Sequence[int], count: int) -> list[tuple[int, int]]:
+    """First and last of frames in rising order that lie close together."""
+    runs: list[tuple[int, int]] = []
+    for frame in frames:
+        if runs and frame - runs[-1][1] <= max(1, _NEAR * count):
+            runs[-1] = (runs[-1][0], frame)
+        else:
+            runs.append((frame, frame))
+    return runs
 
 
 def wind_of(data: RolloutData) -> str:
@@ -142,26 +203,37 @@ def unpack_bytes(text: str) -> bytes:
     return zlib.decompress(base64.b64decode(text))
 
 
-#: The ramp's last colour, of vertices without a value.
+#: The ramp's last colour, of vertices without a value; the codes of values are below.
 _UNKNOWN = 255
-#: What the menu calls a colouring, where that is not its name.
-_LABELS = {"rg": "unbalanced force"}
+#: Codes of values below and above the scale, where there are such.
+_BELOW, _ABOVE = 20, 30
+#: What the menu calls a colouring, factor and unit of its numbers there, and its scale that is the same in every page.
+_SHOWN: dict[str, tuple[str, float, str, tuple[float, float]]] = {
+    "strain": ("strain", 100.0, "%", (0.0, 0.1)),
+    "rg": ("unbalanced force", 1.0, "g", (1e-4, 1.0)),
+    "contact": ("contact", 1e3, "mm", (0.02, 0.0)),
+}
 #: Distance between texture coordinates that a page can hold, and the farthest.
 UV_STEP, _FARTHEST_UV = 2.0**-16, 2.0**14
 _HERE = Path(__file__).parent
 #: Modules by the names under which they are imported.
-_MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js", "data": "data.js", "figures": "figures.js"}
+_OWN = ("data", "figures", "colours", "scene", "camera", "marks", "controls")
+_MODULES = {"three": "three.module.min.js", "orbit": "OrbitControls.js"} | {name: f"{name}.js" for name in _OWN}
 #: Figures of the chart: metric, title.
 _CHARTED = (("strain_p99", "strain p99"), ("relative_gradient", "rg"), ("ms_total", "ms a frame"))
 
 
 def view_page(
-    rollouts: Sequence[tuple[str, RolloutData]], title: str, textures: Sequence[Mapping[str, Texture]] | None = None
+    rollouts: Sequence[tuple[str, RolloutData]],
+    title: str,
+    textures: Sequence[Mapping[str, Texture]] | None = None,
+    verdicts: Sequence[Verdict] | None = None,
 ) -> str:
     """The HTML of named rollouts, which loads nothing from anywhere.
 
     Args:
         textures: of every rollout the images of its garments, by the names of :func:`hood.media.pieces.pieces_of`.
+        verdicts: of every rollout, whose reasons and doubts the time line marks; None marks events and alarms only.
 
     Raises:
         ValueError: there is none, or their frames are not equally far apart in time.
@@ -177,17 +249,20 @@ def view_page(
             )
     every = [data for _, data in rollouts]
     painted = {name: _colourings(every, name) for name in COLOURINGS if all(_has(data, name) for data in every)}
+    levels = {name: _levels(by) for name, by in painted.items()}
     laid_on = textures or [{}] * len(rollouts)
     images = list(dict.fromkeys(texture for by in laid_on for texture in by.values()))
     content = {
         "images": [image.address for image in images],
         "seconds": seconds[0],
-        "moments": [{"frame": frame, "words": words} for frame, words in shared_moments(rollouts)],
+        "moments": shared_marks(rollouts, verdicts),
+        "floor": min(_lowest(data) for data in every),
         "ramp": np.rint(255.0 * colours_at(np.append(np.linspace(0.0, 1.0, _UNKNOWN), np.nan))).astype(int).tolist(),
-        "scales": [_scale(name, by[0]) for name, by in painted.items()],
+        "scales": [_scale(name, by[0], levels[name]) for name, by in painted.items()],
         "rollouts": [
-            _rollout(name, data, {kind: by[at] for kind, by in painted.items()}, every[0] if at else None)
-            | {"mapped": _mapped(data, laid_on[at], images)}
+            _rollout(name, data, every[0] if at else None)
+            | {"values": {kind: pack_bytes(_codes(by[at], levels[kind])) for kind, by in painted.items()}}
+            | _parted(data, laid_on[at], images)
             for at, (name, data) in enumerate(rollouts)
         ],
     }
@@ -205,12 +280,67 @@ def _colourings(rollouts: Sequence[RolloutData], colour: str) -> list[Colouring]
     return [one for one in found if one is not None]
 
 
-def _scale(name: str, colouring: Colouring) -> dict[str, str]:
-    low, high = colouring.ticks[0][1], colouring.ticks[-1][1]
-    return {"name": name, "label": _LABELS.get(name, name), "title": colouring.title, "low": low, "high": high}
+def _lowest(data: RolloutData) -> float:
+    """Height [m] of the floor: the lowest finite point of the body, or of the cloth where there is none."""
+    heights = (data.body_pos if data.body_pos.shape[1] else data.cloth_pos)[..., 1]
+    finite = heights[np.abs(heights) <= _FARTHEST]
+    return float(finite.min()) if finite.size else 0.0
 
 
-def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], first: RolloutData | None) -> dict[str, Any]:
+def _levels(colourings: Sequence[Colouring]) -> np.ndarray:
+    """Places (255,) on a scale, rising, one a code: evenly from 0 to 1 between its ends, and ever wider apart beyond them.
+
+    They go as far as there are values: at most 1,000 lengths of the scale, of a logarithmic one a length below and three above.
+    """
+    farthest = (-1.0, 4.0) if colourings[0].logarithmic else (-1e3, 1e3)
+    place = np.concatenate([_place(one).ravel() for one in colourings])
+    place = np.clip(place[~np.isnan(place)], *farthest)
+    low, high = float(place.min(initial=0.0)), float(place.max(initial=1.0))
+    below, above = (_BELOW if low < 0 else 0), (_ABOVE if high > 1 else 0)
+    return np.concatenate(
+        [
+            low * np.linspace(1.0, 0.0, below, endpoint=False) ** 2,
+            np.linspace(0.0, 1.0, _UNKNOWN - below - above),
+            1.0 + (high - 1.0) * np.linspace(1.0, 0.0, above, endpoint=False)[::-1] ** 2,
+        ]
+    )
+
+
+def _place(colouring: Colouring) -> np.ndarray:
+    """(T, V) where values lie on the scale, also beyond its ends; NaN where there is none."""
+    low, high = colouring.low, colouring.high
+    if colouring.logarithmic:
+        with np.errstate(divide="ignore", invalid="ignore"):  # zero lies below every scale
+            return np.asarray(np.log(colouring.values / low) / np.log(high / low))
+    return np.asarray((colouring.values - low) / (high - low))
+
+
+def _codes(colouring: Colouring, levels: np.ndarray) -> np.ndarray:
+    """(T, V) numbers of the nearest levels."""
+    place = _place(colouring)
+    nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), place)
+    return np.where(np.isnan(place), _UNKNOWN, nearest)
+
+
+def _scale(name: str, colouring: Colouring, levels: np.ndarray) -> dict[str, Any]:
+    label, times, unit, fixed = _SHOWN[name]
+    low, high = colouring.low, colouring.high
+    values = low * (high / low) ** levels if colouring.logarithmic else low + (high - low) * levels
+    return {
+        "name": name,
+        "label": label,
+        "title": colouring.title,
+        "times": times,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "fixed": fixed,
+        "logarithmic": colouring.logarithmic,
+        "levels": [float(f"{value:.5g}") for value in values.tolist()],
+    }
+
+
+def _rollout(name: str, data: RolloutData, first: RolloutData | None) -> dict[str, Any]:
     """One rollout as JSON; its body is null where it is that of the first."""
     cloth, lost = _mesh(data.cloth_pos, data.cloth_faces)
     looks, number = looks_of(data)
@@ -221,7 +351,6 @@ def _rollout(name: str, data: RolloutData, painted: Mapping[str, Colouring], fir
         "note": wind_of(data),
         "cloth": cloth,
         "lost": lost,
-        "values": {kind: pack_bytes(_places(colouring)) for kind, colouring in painted.items()},
         "fabric": pack_bytes(np.rint(255.0 * every)),
         "body": None if same else _mesh(data.body_pos, data.body_faces)[0],
         "figures": [
@@ -237,15 +366,17 @@ def _mesh(pos: np.ndarray, faces: np.ndarray) -> tuple[dict[str, Any], list[int]
     return packed | {"faces": pack_integers(faces)}, lost
 
 
-def _mapped(data: RolloutData, textures: Mapping[str, Texture], images: Sequence[Texture]) -> dict[str, Any] | None:
-    """What is drawn where garments have images, as JSON; None where none has.
+def _parted(data: RolloutData, textures: Mapping[str, Texture], images: Sequence[Texture]) -> dict[str, Any]:
+    """Parts that can be hidden, by the faces, and what is drawn where garments have images; ``mapped`` is None where none has.
 
-    ``points`` are vertices, those on seams of a texture several times, ``faces`` are over points, ``uv`` in steps of
-    :data:`UV_STEP`; ``groups`` say of how many faces in their order which image is drawn on them, null for none.
+    In ``mapped``, ``points`` are vertices, those on seams of a texture several times, ``faces`` are over points, ``uv`` in
+    steps of :data:`UV_STEP`; ``groups`` say of how many faces in their order which image is drawn on them, null for none.
     """
-    if not textures:
-        return None
     pieces = pieces_of(data)
+    names, part = parts_of(data, pieces)
+    parts = {"names": names, "of": pack_integers(part)}
+    if not textures:
+        return {"parts": parts, "mapped": None}
     corners = np.zeros_like(data.cloth_faces)
     table, groups, order, start = [np.zeros((1, 2))], [], [], 1  # coordinate 0 is that of garments without an image
     for piece in pieces:
@@ -261,13 +392,14 @@ def _mapped(data: RolloutData, textures: Mapping[str, Texture], images: Sequence
     chosen = np.concatenate(order)
     points, coordinate, faces = split_seams(data.cloth_faces[chosen], corners[chosen])
     uv = np.clip(np.concatenate(table)[coordinate], -_FARTHEST_UV, _FARTHEST_UV)
-    return {
+    mapped = {
         "points": pack_integers(points),
         "faces": pack_integers(faces),
         "uv": pack_integers(np.rint(uv / UV_STEP)),
         "step": UV_STEP,
         "groups": groups,
     }
+    return {"parts": parts | {"of": pack_integers(part[chosen])}, "mapped": mapped}
 
 
 def _same_body(first: RolloutData, other: RolloutData) -> bool:
@@ -277,12 +409,6 @@ def _same_body(first: RolloutData, other: RolloutData) -> bool:
 def _plain(values: np.ndarray) -> list[float | None]:
     """Four digits of every value; null where there is none."""
     return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
-
-
-def _places(colouring: Colouring) -> np.ndarray:
-    """(T, V) numbers of the ramp's colours."""
-    place = colouring.place(colouring.values)
-    return np.where(np.isfinite(place), np.rint((_UNKNOWN - 1) * np.nan_to_num(place)), _UNKNOWN)
 
 
 def _fill(title: str, content: dict[str, Any]) -> str:

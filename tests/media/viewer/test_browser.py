@@ -85,6 +85,13 @@ def choose(page: Browser, name: str, value: str) -> None:
     page.run(f"(() => {{ const it = document.getElementById('{name}'); it.value = '{value}'; it.onchange(); }})()")
 
 
+def tick(page: Browser, name: str, on: bool) -> None:
+    page.run(
+        f"(() => {{ const it = document.getElementById('{name}'); it.checked = {str(on).lower()};"
+        "if (it.onchange) it.onchange(); })()"
+    )
+
+
 def covered(image: np.ndarray) -> np.ndarray:
     """(H, W) where something stands before the plain background, whose colour is that of a corner."""
     return np.abs(image - image[0, 0]).sum(axis=2) > 12
@@ -93,7 +100,9 @@ def covered(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("frame", [0, 200])
 def test_the_silhouette_is_that_of_the_software_renderer(page: Browser, data: RolloutData, frame: int) -> None:
     """From the page's first camera: 35 degrees, 1.7 diagonals before the middle of the body, which it follows upwards."""
+    tick(page, "floor", False)
     shown = covered(scrub(page, frame))
+    tick(page, "floor", True)
     start, now = data.body_pos[0], data.body_pos[frame]
     extent = float(np.linalg.norm(start.max(axis=0) - start.min(axis=0)))
     target = 0.5 * (now.max(axis=0) + now.min(axis=0))
@@ -168,6 +177,7 @@ def test_rollouts_beside_and_over_each_other(data: RolloutData, tmp_path: Path) 
     path.write_text(view_page([("one", data), ("two", data)], "two tubes"), encoding="utf-8")
     with Browser() as browser:
         browser.open(path)
+        tick(browser, "floor", False)
         beside = covered(scrub(browser, 100))
         half = beside.shape[1] // 2
         assert (beside[:, :half] == beside[:, half : 2 * half]).mean() > 0.99
