@@ -116,7 +116,8 @@ def _follow_body(
 
 def _write_pins(plan: Plan, scene: Any, exported: list[meshes.Exported]) -> None:
     """Pins of all garments; their numbers count through the outfit."""
-    rows, start = [], 0
+    rows: list[dict[str, Any]] = []
+    start = 0
     for garment, mesh in zip(plan.garments, exported, strict=True):
         if garment.pins:
             weights = np.zeros(len(mesh.pos))
@@ -127,7 +128,7 @@ def _write_pins(plan: Plan, scene: Any, exported: list[meshes.Exported]) -> None
             if not len(held):
                 sentence = f"{garment.object}: no vertex of the group {garment.pins!r} has a weight; paint it"
                 raise BakeError(sentence, garment.object)
-            row: dict[str, Any] = {"vertices": (held + start).tolist()}
+            row: dict[str, Any] = {"vertices": (held + start).tolist(), "follows": "skin"}
             if (weights[held] < 0.999).any():
                 row["weights"] = [round(float(weight), 4) for weight in weights[held]]
             if garment.follows:
@@ -135,6 +136,4 @@ def _write_pins(plan: Plan, scene: Any, exported: list[meshes.Exported]) -> None
                 row["follows"] = capture.body_group(depsgraph, object_named(plan.body, plan.body_uid), garment.follows)
             rows.append(row)
         start += len(mesh.pos)
-    plain = all(set(row) == {"vertices"} for row in rows)
-    content: Any = [vertex for row in rows for vertex in row["vertices"]] if plain else rows
-    (plan.folder / command.PINS).write_text(json.dumps(content), encoding="utf-8")
+    (plan.folder / command.PINS).write_text(json.dumps(rows), encoding="utf-8")

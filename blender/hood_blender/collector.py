@@ -50,7 +50,7 @@ class Collector:
             obj = path.with_suffix(".obj")
             if obj.is_file() and not np.array_equal(meshes.read_obj_faces(obj), mesh.faces):
                 raise BakeError(
-                    f"{garment.object}: hood has put its vertices or faces into another order (see the log); separate buttons and "
+                    f"{garment.object}: hood has put its vertices into another order (see the log); separate buttons and "
                     "other small parts into objects of their own",
                     garment.object,
                 )

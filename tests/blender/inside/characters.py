@@ -59,6 +59,7 @@ def character(unit: float = 1.0, swing: float = 0.15) -> tuple[Any, Any]:
     bpy.ops.object.mode_set(mode="OBJECT")
     for name, inside in (("hips", vertices[:, 2] <= 0.5), ("chest", vertices[:, 2] > 0.5)):
         body.vertex_groups.new(name=name).add(np.flatnonzero(inside).tolist(), 1.0, "REPLACE")
+    body.parent = rig
     body.modifiers.new("Armature", "ARMATURE").object = rig
     last = bpy.context.scene.frame_end
     chest = rig.pose.bones["chest"]
