@@ -32,6 +32,7 @@ from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, ro
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.fabrics import fabric_names
 from hood.app.scene.garments import describe_ease, summarise_ease
+from hood.app.scene.motion import describe_pins, summarise_pins
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
 from hood.app.settings.rollout_settings import RolloutSettings, measurement
@@ -223,12 +224,13 @@ def _conclude(
         summary |= summarise_ease(eases[0], eases[-1])
     if scene.holding is not None:
         summary |= summarise_held(scene, data)
+    summary |= summarise_pins(scene, data)
     warn(guard_sentences(summary.get("guard")))
     summary["choice"] = asdict(ready.choice)
     summary |= summarise_plan(folder / "rollout.h5", config)
     _keep_plan(config, folder)
     say(describe(summary))
-    _tell(describe_held(summary))
+    _tell([*describe_pins(summary), *describe_held(summary)])
     _tell(describe_ease(summary))
     _tell(plan_sentences(summary))
     if advise:

@@ -18,12 +18,12 @@ from hood.app.scene.events import checked_events, with_events
 from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
-from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
+from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction, with_pins
 from hood.app.settings.compose import ConfigError, brief, require_choice
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes, measurement
 from hood.app.stepping.automatic import Choice, choose, decided
 from hood.app.stepping.cautions import known_by_slope, scene_cautions, warn
-from hood.app.stepping.cloth_contact import acts, check_cloth_contact, potential_of, tell_if_off
+from hood.app.stepping.cloth_contact import acts, check_cloth_contact, check_soft_pins, potential_of, tell_if_off
 from hood.app.stepping.guarding import check_guard
 from hood.app.stepping.refinement import AUTO, check_refinement, chosen, refined
 from hood.app.stepping.steppers import PLAIN, losses_of, make_network, make_solver, option_of
@@ -119,6 +119,7 @@ def set_up(
         tell(sentence)
     if solves_in_double(settled) != solves_in_double(config):
         scene = make_scene(settled, own)
+    check_soft_pins(settled, scene.held is not None and scene.held.stiffness is not None)
     if acts(settled):
         scene = with_held_layers_apart(scene)
     if not option_of(settled).network and network_of(stepper) is not None:
@@ -160,8 +161,8 @@ def make_scene(config: RolloutSettings, own: Own = NAMED) -> Scene:
     order = None if isinstance(given, Garment) else layer_order(config.layers, _names_in(garment, names))
     garment = cut_to_size(config, garment, motion)
     fabric = fabric_of(config, garment, motion) if own.material is None else own.material
-    scene = with_events(replace(dressed_scene(garment, motion, fabric, checked_sizes(config)), layers=order), config)
-    scene = with_body_friction(scene, config)
+    scene = with_pins(replace(dressed_scene(garment, motion, fabric, checked_sizes(config)), layers=order), config)
+    scene = with_body_friction(with_events(scene, config), config)
     found = misplacement(scene)
     if found is not None and found.grave:
         raise ValueError(

@@ -52,9 +52,10 @@ class StepInput:
 
     dt: Tensor  # (B,) s
     obstacle: Obstacle | None = None
-    pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices only
+    pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices and those of ``pin_stiffness``
     attachments: Attachments | None = None
     time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
+    pin_stiffness: Tensor | None = None  # (V,) N/m of springs to ``pin_target``, 0 where there is none; None: nowhere
 
     def __post_init__(self) -> None:
         on_host = self.dt.device.type == "cpu" and not is_whole()  # values elsewhere are not read back: the host would wait
@@ -85,22 +86,23 @@ def concatenate_step_inputs(steps: Sequence[StepInput], vertex_counts: Sequence[
     obstacles = [step.obstacle for step in steps if step.obstacle is not None]
     if obstacles and len(obstacles) != len(steps):
         raise ValueError("a batch mixes scenes with and without a body; put them in separate batches")
-    pins = None
-    if any(step.pin_target is not None for step in steps):
-        like = next(step.pin_target for step in steps if step.pin_target is not None)
-        pins = torch.cat(
-            [
-                step.pin_target if step.pin_target is not None else like.new_zeros(count, 3)
-                for step, count in zip(steps, vertex_counts, strict=True)
-            ]
-        )
     return StepInput(
         dt=torch.cat([step.dt for step in steps]),
         obstacle=concatenate_obstacles(obstacles) if obstacles else None,
-        pin_target=pins,
+        pin_target=_concatenate_rows([step.pin_target for step in steps], vertex_counts),
         attachments=_concatenate_attachments([step.attachments for step in steps], vertex_counts),
         time=_concatenate_times(steps),
+        pin_stiffness=_concatenate_rows([step.pin_stiffness for step in steps], vertex_counts),
     )
+
+
+def _concatenate_rows(items: Sequence[Tensor | None], vertex_counts: Sequence[int]) -> Tensor | None:
+    """Values of the vertices of all scenes, zeros of those that have none; None where none has."""
+    like = next((item for item in items if item is not None), None)
+    if like is None:
+        return None
+    filled = [like.new_zeros(n, *like.shape[1:]) if i is None else i for i, n in zip(items, vertex_counts, strict=True)]
+    return torch.cat(filled)
 
 
 def _concatenate_times(steps: Sequence[StepInput]) -> Tensor | None:

@@ -1,7 +1,9 @@
-"""Energies of vertices as points with a mass: inertia, weight, and springs between two (buttons, zipper teeth)."""
+"""Energies of vertices as points with a mass: inertia, weight, springs between two (buttons, zipper teeth), and springs to
+places (soft pins)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -114,3 +116,48 @@ def attachment_targets(problem: StepProblem) -> Tensor | None:
         most = attachments.speed.to(gap) * problem.step.dt.to(gap)[problem.cloth.vertex_scene[a]]
         change = torch.minimum(torch.maximum(change, -most), most)
     return gap * ((now + change) / torch.where(now > 0, now, 1.0)).unsqueeze(1)
+
+
+class SoftPins(Energy):
+    """Energy [J] of soft pins, the sum over vertices of ½ k ‖x - t‖².
+
+    k → ``step.pin_stiffness`` [N/m] (V,), t → ``step.pin_target`` [m] (V, 3): both come with the step, and t may move with the
+    body. Vertices that are held exactly have none.
+    """
+
+    kind: ClassVar[str] = "SoftPins"
+    role = Role.ELASTIC
+    form = Form.BLOCKS
+
+    def applies(self, problem: StepProblem) -> bool:
+        return problem.step.pin_stiffness is not None
+
+    def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``next_pos`` (V, 3)."""
+        return self.closed_form(problem).energy(next_pos)
+
+    def closed_form(self, problem: StepProblem, passes: Passes | None = None) -> SpringsToPlaces:
+        """The springs of a step."""
+        stiffness, target = problem.step.pin_stiffness, problem.step.pin_target
+        assert stiffness is not None
+        assert target is not None
+        return SpringsToPlaces(torch.where(problem.cloth.pinned, 0.0, stiffness), target, problem)
+
+
+@dataclass(frozen=True)
+class SpringsToPlaces:
+    """The closed form of :class:`SoftPins`; its matrices are the second derivative."""
+
+    stiffness: Tensor  # (V,) N/m
+    target: Tensor  # (V, 3) m
+    problem: StepProblem
+
+    def energy(self, pos: Tensor) -> Tensor:
+        """Energy [J] (B,) at ``pos`` (V, 3)."""
+        return self.problem.sum_vertices(0.5 * self.stiffness.to(pos) * (pos - self.target.to(pos)).square().sum(dim=1))
+
+    def derivatives(self, pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient [N] (V, 3) and second derivative [N/m] (V, 3, 3) at ``pos`` (V, 3)."""
+        stiffness = self.stiffness.to(pos)
+        matrix = torch.diag_embed(stiffness[:, None].expand(-1, 3))
+        return stiffness[:, None] * (pos - self.target.to(pos)), matrix

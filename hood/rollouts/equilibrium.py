@@ -77,7 +77,7 @@ def without_hold(scene: Scene) -> str | None:
     """Why nothing keeps a part of a worn garment from falling, neither pins nor a body; None where something does."""
     if scene.motion.num_vertices:
         return None
-    parts = _Parts(scene.cloth)
+    parts = _Parts(scene.cloth, None if scene.held is None else scene.held.stiffness)
     if not bool(parts.loose.any()):
         return None
     which = _named(scene, [int(parts.loose.nonzero()[0, 0])]) or "a part of it"
@@ -140,7 +140,7 @@ class _Way:
 
     def __init__(self, problem: StepProblem, start: Tensor) -> None:
         self.problem, self.start = problem, start
-        self.parts = _Parts(problem.cloth)
+        self.parts = _Parts(problem.cloth, problem.step.pin_stiffness)
         self.lost: tuple[int, ...] = ()
 
     @property
@@ -179,7 +179,7 @@ class _Way:
         begun = replace(self.problem, state=replace(self.problem.state, pos=self.start))
         self.problem = _kept(begun, held, self.start)
         self.lost = tuple(sorted({*self.lost, *gone.tolist()}))
-        self.parts = _Parts(self.problem.cloth)
+        self.parts = _Parts(self.problem.cloth, self.problem.step.pin_stiffness)
         return True
 
 
@@ -206,13 +206,14 @@ def _out_of_skin(potential: Potential, problem: StepProblem, pos: Tensor) -> Ten
 class _Parts:
     """The connected parts of a cloth: the garments of an outfit, and what else hangs together."""
 
-    def __init__(self, cloth: Cloth) -> None:
+    def __init__(self, cloth: Cloth, springs: Tensor | None = None) -> None:
+        held = (cloth.pinned if springs is None else cloth.pinned | (springs > 0)).cpu()
         self.free = cloth.free.cpu()
         self.of_vertices = torch.as_tensor(connected_components(cloth.num_vertices, cloth.edges.cpu().numpy()))
         self._free_part = self.of_vertices[self.free]
         count = int(self.of_vertices.max()) + 1 if len(self.of_vertices) else 0
         self._size = torch.bincount(self._free_part, minlength=count)
-        pinned = torch.bincount(self.of_vertices[cloth.pinned.cpu()], minlength=count)
+        pinned = torch.bincount(self.of_vertices[held], minlength=count)
         self.loose = (pinned == 0) & (self._size > 0)  # (P,) bool: they move, and no pin holds them
 
     @property

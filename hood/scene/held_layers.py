@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hood.assets.garment.garment import Garment
 from hood.scene.body_motion.motion import BodyMotion
+from hood.scene.following import held_by
 from hood.scene.scene import LEAD_IN, Scene
 from hood.scene.start import settle
 from hood.scene.untangle import TangledError, crossing_pairs, likely_orders, separate
@@ -64,7 +65,8 @@ def with_held_layers_apart(scene: Scene) -> Scene:
         f"{1e3 * float(farthest.max()):.0f} mm; their rest shapes stay",
         stacklevel=2,
     )
-    return replace(scene, garment=_shifted(scene.garment, lead, shift))
+    garment = _shifted(scene.garment, lead, shift)
+    return replace(scene, garment=garment, held=scene.held and held_by(scene.held.groups, motion, garment))
 
 
 def _shifted(garment: Garment, motion: BodyMotion, shift: Tensor) -> Garment:

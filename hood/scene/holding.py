@@ -148,6 +148,13 @@ class Holding:
                 held = held & ~grasp.vertices
         return held if held is not None and bool(held.any()) else None
 
+    def let_go(self, frame: int, vertices: Tensor) -> Tensor:
+        """Which of ``vertices`` (V,) bool a grasp has let go by the step of ``frame``, (V,) bool."""
+        free = torch.zeros_like(vertices)
+        for grasp in self.grasps[: self._passed(frame)]:
+            free = free & ~grasp.vertices if grasp.holds else free | grasp.vertices
+        return free & vertices
+
     def targets(self, frame: int, here: Tensor, there: Tensor, pos: Tensor, dt: float) -> Tensor:
         """Where held vertices go in the step of ``frame``, (V, 3) m: ``there``, and those that a grasp holds nearer to it by
         what the speed allows, from ``pos`` (V, 3) with the skinned garment ``here`` at the start of the step."""

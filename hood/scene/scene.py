@@ -16,6 +16,7 @@ from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import Attachments, State, StepInput, centres_of
 from hood.mesh.flat import followed
 from hood.scene.body_motion.motion import BodyMotion, Motion, body_motion
+from hood.scene.following import Held
 from hood.scene.holding import Fastening, Holding, fastening_of
 from hood.scene.sizing import GarmentSize, Sizes, resized, sizes_of
 from hood.scene.start import free_stretch, leave_by_centroids, settle
@@ -53,6 +54,7 @@ class Scene:
     sizes: Sizes = Sizes()  # of the rest shape; that of ``cloth`` is the first
     fastening: Fastening | None = None  # of steps that are given no attachments; None: nothing is fastened
     holding: Holding | None = None  # what is held and let go; None: the pins of ``cloth``, throughout
+    held: Held | None = None  # what pins follow, and soft ones; None: all are held exactly where the skinned garment has them
     friction_scale: Tensor | None = None  # (G,) factors on the coefficient of friction on the body's faces; None: 1
 
     def cloth_at(self, frame: int, start: int = 0) -> Cloth:
@@ -65,6 +67,12 @@ class Scene:
         ends with, with what is held in it."""
         cloth = self.cloth_at(frame + 1, start) if self.sizes.changing else self.cloth
         return cloth if self.holding is None else self.holding.cloth(cloth, frame)
+
+    def skinned(self, frame: int, origin: np.ndarray) -> Tensor:
+        """(V, 3) m: the garment moving with the body alone at ``frame``, relative to ``origin``; pins that follow the skin with
+        that."""
+        pos = self.motion.skinned(self.garment, frame, origin)
+        return pos if self.held is None else self.held.placed(pos, self.motion.surface(frame, origin))
 
     @property
     def num_frames(self) -> int:
@@ -88,7 +96,7 @@ class Scene:
             pos = torch.as_tensor(self.start_pos - origin).to(self.cloth.rest_pos)
             return State(pos=pos, vel=vel, origin=torch.as_tensor(origin).unsqueeze(0))
         origin = local_origin(self.motion.translation[frame])
-        skinned = self.motion.skinned(self.garment, frame, origin)
+        skinned = self.skinned(frame, origin)
         obstacle = self.motion.obstacle(frame, origin, static=True)
         if by_centroids and obstacle is not None:
             pos = leave_by_centroids(self.cloth, skinned, obstacle, self.clearance)
@@ -169,9 +177,7 @@ class Scene:
         if frame + 1 >= self.num_frames:
             return torch.zeros_like(self.cloth.rest_pos)
         origin = self.motion.translation[frame]
-        return (
-            self.motion.skinned(self.garment, frame + 1, origin) - self.motion.skinned(self.garment, frame, origin)
-        ) / self.dt
+        return (self.skinned(frame + 1, origin) - self.skinned(frame, origin)) / self.dt
 
     def skinned_acceleration(self, frame: int) -> Tensor:
         """(V, 3) m per frame²: x⁺ − 2x + x⁻ of the skinned garment at ``frame``, or at the nearest frame that has both
@@ -180,7 +186,7 @@ class Scene:
             return torch.zeros_like(self.cloth.rest_pos)
         frame = min(max(frame, 1), self.num_frames - 2)
         origin = self.motion.translation[frame]
-        before, now, after = (self.motion.skinned(self.garment, frame + k, origin) for k in (-1, 0, 1))
+        before, now, after = (self.skinned(frame + k, origin) for k in (-1, 0, 1))
         return after - 2 * now + before
 
     def step_input(
@@ -198,10 +204,11 @@ class Scene:
         origin = state.origin[0].numpy()
         pins = None
         cloth = self.cloth if self.holding is None or relaxing else self.holding.cloth(self.cloth, frame)
-        if cloth.has_pinned:
-            pins = self.motion.skinned(self.garment, frame if relaxing else frame + 1, origin)
+        soft = self._soft_pins(frame, relaxing)
+        if cloth.has_pinned or soft is not None:
+            pins = self.skinned(frame if relaxing else frame + 1, origin)
             if self.holding is not None and not relaxing and not jumping:
-                here = self.motion.skinned(self.garment, frame, origin)
+                here = self.skinned(frame, origin)
                 pins = self.holding.targets(frame, here, pins, state.pos, self.dt)
         dt = RELAXING_DT if relaxing else self.dt
         time = (frame if relaxing else frame + 1) * self.dt
@@ -214,7 +221,14 @@ class Scene:
             pin_target=pins,
             attachments=attachments,
             time=state.pos.new_full((1,), time),
+            pin_stiffness=soft,
         )
+
+    def _soft_pins(self, frame: int, relaxing: bool) -> Tensor | None:
+        """(V,) N/m of springs in the step of ``frame``; None where there are none."""
+        if self.held is None or self.held.stiffness is None or self.holding is None or relaxing:
+            return None if self.held is None else self.held.stiffness
+        return torch.where(self.holding.let_go(frame, self.held.stiffness > 0), 0.0, self.held.stiffness)
 
 
 def build_scene(

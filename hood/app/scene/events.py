@@ -20,7 +20,7 @@ from torch import Tensor
 from hood.app.settings.compose import ConfigError, plain
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes
 from hood.assets.files.library import unknown
-from hood.assets.garment.pins import pin_mask
+from hood.assets.garment.pins import pin_mask, pin_numbers
 from hood.rollouts.file.reader import RolloutData
 from hood.scene.body_motion.motion import BodyMotion
 from hood.scene.holding import CLOSED, SPEED, Event, Grasp, Holding, first_step
@@ -131,7 +131,7 @@ def summarise_held(scene: Scene, data: RolloutData) -> dict[str, Any]:
 def _off(scene: Scene, pos: np.ndarray, frame: int, chosen: np.ndarray) -> float:
     """How far [m] chosen vertices (K,), at ``pos`` (K, 3), are from where the skinned garment has them, at most."""
     origin = scene.motion.translation[frame]
-    there = scene.motion.skinned(scene.garment, frame, origin).cpu().double().numpy() + origin
+    there = scene.skinned(frame, origin).cpu().double().numpy() + origin
     return float(np.linalg.norm(pos - there[chosen], axis=1).max())
 
 
@@ -275,14 +275,15 @@ def _with_rows(scene: Scene, asked: list[Asked]) -> Scene:
 def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
     if not asked:
         return scene
-    held, grasps = scene.cloth.pinned, list[Grasp]()
+    held, grasps, soft = scene.cloth.pinned, list[Grasp](), _soft(scene)
     for one in sorted(asked, key=lambda event: event.first_step(scene.dt)):
         where, frame, holds = f"events[{one.index}]", one.first_step(scene.dt), VERTICES[one.action]
         try:
             vertices = _vertices(scene, one.names).to(held.device)
         except ValueError as error:
             raise ConfigError(f"{where}: {one.action}: {str(error).removeprefix('pins: ')}") from error
-        if not bool((vertices & (held != holds)).any()):
+        changed = ~held if holds else held | soft
+        if not bool((vertices & changed).any()):
             state = "held already" if holds else "held then; pins=… holds vertices from the start"
             raise ConfigError(f"{where}: {one.action}: {'all' if holds else 'none'} of these vertices are {state}")
         clash = next((grasp for grasp in grasps if grasp.frame == frame and grasp.holds != holds), None)
@@ -290,7 +291,7 @@ def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
             raise ConfigError(
                 f"{where}: {one.action}: another event in frame {frame} does the opposite to some of these vertices"
             )
-        held = held | vertices if holds else held & ~vertices
+        held, soft = (held | vertices, soft) if holds else (held & ~vertices, soft & ~vertices)
         grasps.append(Grasp(frame, vertices, holds, one.speed))
     return replace(scene, holding=Holding(tuple(grasps)))
 
@@ -298,11 +299,20 @@ def _with_grasps(scene: Scene, asked: list[Asked]) -> Scene:
 def _vertices(scene: Scene, names: tuple[str | int, ...]) -> Tensor:
     """(V,) bool."""
     body = scene.motion.body if isinstance(scene.motion, BodyMotion) else None
-    mask = pin_mask([name for name in names if name != PINS], scene.garment, body)
-    chosen = torch.as_tensor(mask | scene.garment.pinned if PINS in names else mask)
+    named = [name for name in names if name != PINS]
+    pin_numbers(named)  # refuses tables
+    chosen = torch.as_tensor(pin_mask(named, scene.garment, body))
+    if PINS in names:
+        chosen = chosen | torch.as_tensor(scene.garment.pinned) | _soft(scene).cpu()
     if not bool(chosen.any()):
         raise ValueError("there are no such vertices; give a region, painted, vertex numbers, or a .txt or .json list of them")
     return chosen
+
+
+def _soft(scene: Scene) -> Tensor:
+    """(V,) bool: vertices that springs hold."""
+    soft = None if scene.held is None else scene.held.stiffness
+    return torch.zeros_like(scene.cloth.pinned) if soft is None else soft > 0
 
 
 def _warn_if_late(event: Asked, frame: int, num_frames: int, dt: float) -> None:

@@ -23,7 +23,7 @@ from hood.assets.fitting.suspicions import Suspicion, suspect_kind, suspect_seam
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.parts import elasticated, tailored
-from hood.assets.garment.pins import pin_mask
+from hood.assets.garment.pins import Pins, pin_mask
 from hood.assets.garment.record import Wanted
 from hood.mesh.editing.repair import FLAT
 from hood.rollouts.frame import Ease
@@ -157,16 +157,15 @@ def heed(name: str, suspicions: Sequence[Suspicion]) -> None:
         warnings.warn(f"garment {name!r} {suspicion.sentence}", stacklevel=2)
 
 
-def checked_pins(pins: Any) -> str | int | Sequence[str | int]:
-    """A config value for pins: a word, a number, or a list of them.
+def checked_pins(pins: Any) -> Pins:
+    """A config value for pins: a word, a number, a table, or a list of them.
 
     Raises:
         ConfigError: something else.
     """
-    if isinstance(pins, (str, int)) and not isinstance(pins, bool):
-        return pins
-    if isinstance(pins, list) and all(isinstance(pin, (str, int)) and not isinstance(pin, bool) for pin in pins):
-        return pins
+    one: list[Any] = pins if isinstance(pins, list) else [pins]
+    if all(isinstance(pin, (str, int, dict)) and not isinstance(pin, bool) for pin in one):
+        return one
     raise ConfigError(
         f"pins={brief(pins)}: give vertex numbers, regions or lists, such as pins=[waistband,12,13] or pins=held.txt"
     )

@@ -15,6 +15,7 @@ from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, f
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
 from hood.assets.files.library import unknown
+from hood.energies.mass_points import SoftPins
 from hood.energies.potential import Potential
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.energies.term import Role, Term, having
@@ -41,14 +42,25 @@ def check_cloth_contact(config: RolloutSettings) -> None:
 
 
 def potential_of(config: RolloutSettings) -> Potential:
-    """The potential of the config's losses, with a barrier and friction between layers of cloth where ``cloth_contact`` and the
-    rest of the settled config ask for them."""
+    """The potential of the config's losses and of soft pins, with a barrier and friction between layers of cloth where
+    ``cloth_contact`` and the rest of the settled config ask for them."""
     potential: Potential = losses_of(config)
+    if plain(config.pins) is not None:
+        potential = potential.with_terms(soft_pins=SoftPins())
     asked = cloth_contact(config)
     if asked.mode == "off" or _why_not(config, potential):
         return potential
     potential = potential.with_terms(layers=LayerBarrier(between=asked.mode == "layers"))
     return potential.with_terms(layer_friction=LayerFriction(float(asked.friction))) if asked.friction > 0 else potential
+
+
+def check_soft_pins(config: RolloutSettings, soft: bool) -> None:
+    """Raise ConfigError where pins are ``soft`` and nobody in the settled config knows of them."""
+    if soft and option_of(config).network and chosen(config) is None:
+        raise ConfigError(
+            "pins: weights below 1 are springs, of which a network alone knows nothing; add refine=5, use stepper=newton, or "
+            "leave weights out"
+        )
 
 
 def acts(config: RolloutSettings) -> bool:

@@ -5,7 +5,7 @@ Linear blend skinning of SMPL-family bodies and of the garments bound to them. D
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.library import unknown
-from hood.assets.files.text import read_indices
+from hood.assets.files.text import meant, read_indices
 from hood.assets.motion.sequence import NUM_BODY_JOINTS, PoseSequence
 
 
@@ -161,22 +161,30 @@ class Body:
         return linear_blend_skinning(rest, weights, self.transforms(sequence, betas, torch.float64))
 
 
-def body_part(part: str, faces: np.ndarray, num_vertices: int, body: Body | None) -> np.ndarray:
+def body_part(
+    part: str, faces: np.ndarray, num_vertices: int, body: Body | None, bones: Mapping[str, np.ndarray] | None = None
+) -> np.ndarray:
     """(G,) bool: the faces of a part of a body. A face is of the side of its centre, or of most of its corners.
 
     Args:
-        part: a joint, whose part is what follows it most (``left_wrist``); ``above_JOINT`` or ``below_JOINT``, by the height in
-            T-pose; or the path of a ``.txt`` or ``.json`` list of vertices.
+        part: a joint or a bone, whose part is what follows it most (``left_wrist``); ``above_JOINT`` or ``below_JOINT``, by the
+            height in T-pose; or the path of a ``.txt`` or ``.json`` list of vertices.
         faces: (G, 3) of the body's surface.
         num_vertices: W.
-        body: whose joints are meant; None where the surface has none, and is known by its vertices alone.
+        body: whose joints are meant; None where the surface has none, and is known by its bones and vertices alone.
+        bones: of a mesh, the vertices (W,) bool that follow each most, by name.
 
     Raises:
         ValueError: the body has no such part, or no face in it; names what there is.
     """
     side, _, joint = part.partition("_")
+    bone = meant(part, bones or {})
     if Path(part).suffix.lower() in (".txt", ".json"):
         found = _listed(Path(part).expanduser(), faces, num_vertices)
+    elif bones and bone is not None:
+        found = bones[bone][faces].sum(axis=1) >= 2
+    elif bones and body is None:
+        raise ValueError(f"part {part!r}: {unknown('bone', part, bones)}; or a .txt or .json list of the body's vertices")
     elif side in ("above", "below") and joint:
         of, number = _joint(part, joint, body)
         height = of.v_template[faces].mean(axis=1)[:, 1]

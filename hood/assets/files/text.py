@@ -139,6 +139,18 @@ def read_indices(path: Path) -> np.ndarray:
     return np.array(values, dtype=np.int64)
 
 
+def read_objects(path: Path) -> list[dict[str, Any]] | None:
+    """The objects of a JSON file that is one or a list of them; None of any other file."""
+    if not path.is_file() or path.stat().st_size > _LIST_LIMIT:
+        return None
+    try:
+        content = json.loads(read_text(path))
+    except (ValueError, RecursionError):
+        return None
+    objects = content if isinstance(content, list) else [content]
+    return objects if objects and all(isinstance(one, dict) for one in objects) else None
+
+
 _WHOSE = (
     "mocap|motion|video|source|src|original|orig|capture|captured|recorded|recording|sequence|seq|data|camera|cam|smpl|pose"
 )

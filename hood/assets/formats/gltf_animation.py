@@ -185,6 +185,7 @@ class AnimatedScene(NamedTuple):
     rest: np.ndarray  # (W, 3)
     transforms: np.ndarray | None  # (T, J, 3, 4) of the joints, rest to posed; None without exactly one skin
     weights: np.ndarray | None  # (W, J) of the skin
+    joints: tuple[str, ...] = ()  # (J,) their names
 
 
 def read_gltf_animation(path: Path, fps: float, animation: int | str = 0, parts: Sequence[str] = ()) -> AnimatedScene:
@@ -227,10 +228,12 @@ def _evaluate(gltf: Gltf, fps: float, animation: int | str, parts: Sequence[str]
     faces = np.concatenate([_outward(mesh, player, times) + offset for mesh, offset in zip(meshes, offsets, strict=False)])
     kept, faces = _weld(np.concatenate([mesh.pos for mesh in meshes]), verts, faces)
     bones, weights = None, None
+    names: tuple[str, ...] = ()
     if skin is not None:
         bones = (np.concatenate(transforms) @ np.linalg.inv(still[0].joint_matrices(skin, *still[1:])))[:, :, :3]
         weights = np.concatenate([mesh.weights for mesh in meshes if mesh.weights is not None])[kept]
-    return AnimatedScene(verts[:, kept], faces, rest[kept], bones, weights)
+        names = tuple(str(player.nodes[joint].get("name", joint)) for joint in skin["joints"])
+    return AnimatedScene(verts[:, kept], faces, rest[kept], bones, weights, names)
 
 
 def _common_skin(gltf: Gltf, meshes: Sequence[_Mesh]) -> dict[str, Any] | None:

@@ -38,6 +38,7 @@ class VertexFile(NamedTuple):
     transforms: Any = None  # (N, J, 3, 4) or (N, J, 4, 4)
     rest: np.ndarray | None = None  # (W, 3), of glTF
     weights: np.ndarray | None = None  # (W, J), of glTF
+    joints: tuple[str, ...] = ()  # names of J, of glTF
 
 
 def read_vertex_archive(path: Path) -> VertexFile:

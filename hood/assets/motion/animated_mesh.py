@@ -160,7 +160,8 @@ def load_mesh_sequence(
         sentence = f"{path}: says no frame rate, {rate:g} fps are assumed; file_fps=… gives the right one"
         warnings.warn(Doubt("frame_rate", sentence, value=rate, unit="fps"), stacklevel=2)
     bones = _bones(path, content)
-    sequence = MeshSequence(path.stem, verts, faces, rate, bones, content.rest, content.weights, fps_assumed=assumed)
+    skin = bones, content.rest, content.weights, content.joints
+    sequence = MeshSequence(path.stem, verts, faces, rate, *skin, fps_assumed=assumed)
     return _performed(path, sequence, fps, up, start, stop, loop, scale)
 
 
@@ -213,7 +214,8 @@ def _read(path: Path, fps: float, animation: int | str, parts: Sequence[str], en
     if suffix in _GLTF_SUFFIXES:
         scene = read_gltf_animation(path, fps, animation, parts if entry is None else (entry,))
         skinned = scene.transforms is not None
-        return VertexFile(scene.verts, scene.faces, fps, scene.transforms, scene.rest if skinned else None, scene.weights)
+        rest = scene.rest if skinned else None
+        return VertexFile(scene.verts, scene.faces, fps, scene.transforms, rest, scene.weights, scene.joints)
     if suffix in _STILL_SUFFIXES:
         mesh = read_mesh_file(path, True)
         mesh = mesh if entry is None else object_alone(path, mesh, entry)

@@ -31,11 +31,20 @@ class MeshSequence:
     transforms: np.ndarray | None = None  # (T, J, 3, 4) float64
     rest: np.ndarray | None = None  # (W, 3) m, float64
     weights: np.ndarray | None = None  # (W, J)
+    joints: tuple[str, ...] = ()  # names of J; empty where the file has none
     fps_assumed: bool = False  # the file does not say a frame rate
 
     @property
     def num_frames(self) -> int:
         return len(self.verts)
+
+    @property
+    def bones(self) -> dict[str, np.ndarray]:
+        """By the name of each joint the vertices (W,) bool that follow it most; empty where they have no weights or names."""
+        if self.weights is None:
+            return {}
+        most = self.weights.argmax(axis=1)
+        return {name: most == number for number, name in enumerate(self.joints)}
 
     def window(self, start: int, stop: int) -> MeshSequence:
         """Frames ``start:stop``."""

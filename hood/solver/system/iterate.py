@@ -169,7 +169,12 @@ def _in_precision(problem: StepProblem, cloth: Cloth) -> StepProblem:
     return StepProblem(
         cloth,
         to_device(problem.state, dtype=real),
-        replace(step, dt=step.dt.to(real), pin_target=None if step.pin_target is None else step.pin_target.to(real)),
+        replace(
+            step,
+            dt=step.dt.to(real),
+            pin_target=None if step.pin_target is None else step.pin_target.to(real),
+            pin_stiffness=None if step.pin_stiffness is None else step.pin_stiffness.to(real),
+        ),
         None if problem.contact is None else to_device(problem.contact, dtype=real),
         problem.gravity.to(real),
         tuple(to_device(points, dtype=real) for points in problem.point_contacts),
