@@ -119,7 +119,7 @@ def _run(plan: Plan, progress: Progress, captured: Captured) -> Iterator[float]:
         if running.code is None:  # cancelled: hood keeps what is done
             running.interrupt()
             _end(running)
-        collector.collect()
+        collector.collect_all()
         state.write_state(plan.folder, samples_there=collector.samples)
     _judge(plan, progress, running, collector)
 

@@ -18,6 +18,8 @@ from .plan import Captured, Plan, Progress
 FAR = 0.05
 #: Farther from the origin than this [m] everything is moved near to it: hood and PC2 files hold single precision.
 _FAR_OUT = 10.0
+#: Farther than this [m] from there hood's point caches would change their origin.
+_FARTHEST = 30.0
 #: Frames that say whether a body still moves as it was captured.
 _PROBES = 5
 
@@ -86,6 +88,12 @@ def _pose(plan: Plan, moment: float, scale: float, origin: np.ndarray, first: ca
     body = object_named(plan.body, plan.body_uid)
     pose = capture.body_pose(depsgraph, body, scale, origin)
     capture.check_same(body, first or pose, pose, moment)
+    far = float(np.abs(pose.pos).max())
+    if far > _FARTHEST:
+        raise BakeError(
+            f"body {plan.body}: is {far:.0f} m from where it was at first in frame {moment:g}; bake a range in which it stays "
+            f"within {_FARTHEST:g} m"
+        )
     return pose
 
 

@@ -22,13 +22,13 @@ class Collector:
         self._rest: list[np.ndarray] = []  # in the space of the object, for loose vertices
 
     def collect(self, most: int = 50) -> int:
-        """Bring what is new, of all garments alike, and at most so many frames; returns the frames that are there."""
+        """Bring what is new, of all garments alike, and of it at most so many frames; returns the frames that are there."""
         paths = [state.cache_of(self.plan.folder, garment.file) for garment in self.plan.garments]
         headers = [None if path is None else point_cache.read_header(path) for path in paths]
         if any(header is None for header in headers):
             return self.samples
         there = min(header.samples for header in headers if header is not None)
-        while there > self.samples:
+        if there > self.samples:
             last = min(there, self.samples + most)
             if not self._caches:
                 self._begin(paths, headers)
@@ -36,8 +36,15 @@ class Collector:
                 assert path is not None
                 self._bring(place, point_cache.read_samples(path, self.samples, last))
             self.samples = last
-        self._refresh()
+            self._refresh()
         return self.samples
+
+    def collect_all(self) -> None:
+        """Bring all that is there."""
+        before = -1
+        while before != self.samples:
+            before = self.samples
+            self.collect()
 
     def _begin(self, paths: list[Any], headers: list[Any]) -> None:
         for garment, mesh, path, header in zip(self.plan.garments, self.captured.exported, paths, headers, strict=True):
@@ -80,7 +87,7 @@ class Collector:
             self._caches[place].add(local)
 
     def _refresh(self) -> None:
-        if self._caches and not self.plan.estimate:
+        if not self.plan.estimate:
             for garment in self.plan.garments:
                 results.refresh(object_named(garment.object, garment.uid))
 

@@ -34,7 +34,6 @@ class Fault:
 REPAIRS: dict[str, tuple[str, tuple[str, ...]]] = {
     "settle": ("Start from relaxing steps", ("settle=3",)),
     "finer": ("Solve further and check every frame", ("solver.target_rg=0.003", "guard=repair")),
-    "comes_off": ("It may come off the body", ("worn=false",)),
     "sew": ("Sew rims up to 5 mm apart", ()),
     "smaller": ("5% smaller", ("size=0.95",)),
     "larger": ("5% larger", ("size=1.05",)),

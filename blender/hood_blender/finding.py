@@ -15,7 +15,7 @@ from .fault import BakeError
 
 #: The first version that understands the commands of this add-on.
 OLDEST = (0, 1, 0)
-#: What pip fetches where the user names nothing else.
+#: What pip knows hood as.
 PACKAGE = "hood-cloth"
 _WINDOWS = os.name == "nt"
 
@@ -77,19 +77,22 @@ def install_commands(python: str, own: Path, source: str) -> list[list[str]]:
 
     Args:
         python: that makes the environment, 3.11 or newer.
-        source: a wheel, a folder of wheels or of hood's code, the address of an index, or empty: :data:`PACKAGE` from pip's.
+        source: a wheel, a folder of wheels or of hood's code, or the address of an index.
+
+    Raises:
+        BakeError: it names nothing of these: a package of this name elsewhere may be another project's.
     """
     given = Path(source).expanduser()
     if not source:
-        wanted = [PACKAGE]
-    elif re.match(r"https?://", source):
+        raise BakeError("no source is named; give a wheel, a folder, or the address of an index that has hood-cloth")
+    if re.match(r"https?://", source):
         wanted = ["--index-url", source, PACKAGE]
     elif given.is_dir() and not (given / "pyproject.toml").is_file():
         wanted = ["--find-links", str(given), PACKAGE]
     elif given.exists():
         wanted = [str(given)]
     else:
-        raise BakeError(f"{source}: no such wheel or folder; give one, the address of an index, or nothing for {PACKAGE}")
+        raise BakeError(f"{source}: no such wheel or folder; give one, or the address of an index")
     pip = [str(python_of(own)), "-m", "pip", "install", "--upgrade", *wanted]
     return [[python, "-m", "venv", "--clear", str(own)], pip]
 

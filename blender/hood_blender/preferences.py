@@ -7,7 +7,6 @@ from typing import Any
 import bpy
 from bpy.props import StringProperty
 
-from . import finding
 from .folders import own_hood
 from .job import job_of
 
@@ -26,7 +25,7 @@ class HoodPreferences(bpy.types.AddonPreferences):
     source: StringProperty(  # type: ignore[valid-type]
         name="Source",
         subtype="FILE_PATH",
-        description=f"Wheel, folder of wheels or of code, or address of an index; empty: {finding.PACKAGE} from pip's",
+        description="Wheel, folder of wheels or of hood's code, or address of an index that has hood-cloth",
     )
     python: StringProperty(  # type: ignore[valid-type]
         name="Python", subtype="FILE_PATH", description="Python 3.11 or newer that makes the environment; empty: Blender's own"
@@ -39,8 +38,8 @@ class HoodPreferences(bpy.types.AddonPreferences):
         box = layout.box()
         box.prop(self, "source")
         box.prop(self, "python")
-        what = self.source or f"{finding.PACKAGE} from pip's index"
-        box.label(text=f"Fetches {what} with PyTorch, NumPy, SciPy and others: about 1 GB, 3 GB on disk")
+        what = f"Fetches {self.source}" if self.source else "Name a source; fetches it"
+        box.label(text=f"{what} with PyTorch, NumPy, SciPy and others: about 1 GB, 3 GB on disk")
         box.label(text=f"Into {own_hood()}")
         box.operator("hood.install")
         job = job_of(INSTALL)

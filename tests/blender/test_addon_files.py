@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from blender import make_zip
 from blender.hood_blender import axes, meshes, point_cache
 from blender.hood_blender.body_file import BodyFile, is_body_file
 from blender.hood_blender.fault import BakeError
-
 from hood.assets.formats.vertex_files import read_point_cache
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import load_mesh_sequence

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from blender.hood_blender import fault, process
 
 NAMES = ["slip", "coat"]

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
 from blender.hood_blender import command, finding, state
 from blender.hood_blender.fault import REPAIRS, BakeError
-
 from hood import __version__
 from hood.app.plan_file import rollout_config
 from hood.app.settings.compose import options
@@ -124,7 +124,6 @@ def test_an_installation_fetches_from_what_the_user_names(tmp_path: Path) -> Non
     code.mkdir()
     (code / "pyproject.toml").write_text("")
     for source, last in (
-        ("", [finding.PACKAGE]),
         ("https://example.org/simple", ["--index-url", "https://example.org/simple", finding.PACKAGE]),
         (str(wheel), [str(wheel)]),
         (str(code), [str(code)]),
@@ -133,6 +132,8 @@ def test_an_installation_fetches_from_what_the_user_names(tmp_path: Path) -> Non
         venv, pip = finding.install_commands("python3.11", own, source)
         assert venv == ["python3.11", "-m", "venv", "--clear", str(own)]
         assert pip == [str(finding.python_of(own)), "-m", "pip", "install", "--upgrade", *last]
+    with pytest.raises(BakeError, match="no source is named; give a wheel"):
+        finding.install_commands("python3.11", own, "")
     with pytest.raises(BakeError, match="gone.whl: no such wheel or folder"):
         finding.install_commands("python3.11", own, str(tmp_path / "gone.whl"))
 
