@@ -24,6 +24,8 @@ from .plan import Captured, Plan, Progress
 _KNOWN: set[tuple[Any, ...]] = set()
 #: Seconds between two looks at the process.
 _WAIT = 0.25
+#: Seconds that hood has to end in when it is asked to.
+_PATIENCE = 15.0
 
 
 def bake(plan: Plan, progress: Progress) -> Iterator[float]:
@@ -101,32 +103,44 @@ def _run(plan: Plan, progress: Progress, captured: Captured) -> Iterator[float]:
     collector = Collector(plan, captured, kept.get("samples_there", 0) if kept.get("run") == key else 0)
     progress.work, progress.done, progress.total = "Starting hood", 0, plan.last - plan.first + 1
     running = process.Process([*plan.hood, *words], plan.folder, plan.folder / "log.txt", plan.threads)
-    began, at_first = time.monotonic(), None
+    progress.runs = True
     try:
-        while running.code is None:
-            progress.done = max(progress.done, collector.collect())
-            said = process.how_far(running.said())
-            if collector.samples:
-                progress.work, at_first = "Simulating", at_first or (collector.samples, time.monotonic())
-                progress.left = process.time_left(
-                    collector.samples - at_first[0], progress.total - at_first[0], time.monotonic() - at_first[1]
-                )
-            elif said is not None:
-                progress.work, progress.done, progress.total = said[0].capitalize(), said[1], said[2]
-                progress.left = process.time_left(said[1], said[2], time.monotonic() - began)
-            yield _WAIT
+        yield from _watch(progress, running, collector)
     finally:
-        if running.code is None:  # cancelled: hood keeps what is done
+        progress.runs = False
+        if running.code is None:  # Blender ends, or the collector has failed
             running.interrupt()
             _end(running)
         collector.collect_all()
         state.write_state(plan.folder, samples_there=collector.samples)
-    _judge(plan, progress, running, collector)
+    if not progress.cancel:
+        _judge(plan, progress, running, collector)
 
 
-def _end(running: process.Process, patience: float = 15.0) -> None:
+def _watch(progress: Progress, running: process.Process, collector: Collector) -> Iterator[float]:
+    """Bring frames and tell how far hood is until it ends; where the user cancels, it ends with the frame that it is at."""
+    began, first, until = time.monotonic(), None, 0.0
+    while running.code is None:
+        progress.done = max(progress.done, collector.collect())
+        said, now = process.how_far(running.said()), time.monotonic()
+        if progress.cancel and not until:
+            progress.work, progress.left, until = "Stopping", "", now + _PATIENCE
+            running.interrupt()
+        elif progress.cancel and now > until:
+            running.kill()
+        elif collector.samples and not progress.cancel:
+            first = first or (collector.samples, now)
+            progress.work, progress.done, progress.total = "Simulating", collector.samples, collector.total
+            progress.left = process.time_left(collector.samples - first[0], collector.total - first[0], now - first[1])
+        elif said is not None and not progress.cancel:
+            progress.work, progress.done, progress.total = said[0].capitalize(), said[1], said[2]
+            progress.left = process.time_left(said[1], said[2], now - began)
+        yield _WAIT
+
+
+def _end(running: process.Process) -> None:
     """Wait until an interrupted process has ended, then end it."""
-    until = time.monotonic() + patience
+    until = time.monotonic() + _PATIENCE
     while running.code is None and time.monotonic() < until:
         time.sleep(0.05)
     running.kill()

@@ -18,6 +18,7 @@ class Collector:
 
     def __init__(self, plan: Plan, captured: Captured, kept: int) -> None:
         self.plan, self.captured, self.samples, self._kept = plan, captured, 0, kept
+        self.total = plan.last - plan.first + 1
         self._caches: list[point_cache.GrowingCache] = []
         self._rest: list[np.ndarray] = []  # in the space of the object, for loose vertices
 

@@ -10,11 +10,15 @@ import bpy
 from .meshes import plain_name
 
 
+def temporary_folder() -> Path:
+    """A folder of this session, for files that are not saved."""
+    return Path(bpy.app.tempdir or tempfile.gettempdir())
+
+
 def bake_folder(name: str) -> Path:
-    """``hood_cache/NAME`` beside the .blend; of a file that is not saved in the temporary folder of this session."""
-    if bpy.data.filepath:
-        return Path(bpy.path.abspath("//")).resolve() / "hood_cache" / plain_name(name)
-    return Path(bpy.app.tempdir or tempfile.gettempdir()) / "hood_cache" / plain_name(name)
+    """``hood_cache/NAME`` beside the .blend; of a file that is not saved in the temporary folder."""
+    beside = Path(bpy.path.abspath("//")).resolve() if bpy.data.filepath else temporary_folder()
+    return beside / "hood_cache" / plain_name(name)
 
 
 def own_hood() -> Path:

@@ -13,6 +13,7 @@ from .plan import Progress
 
 #: Of a tenth of a second so much is work [s]; the rest is the user's.
 _SLICE, _PAUSE = 0.06, 0.02
+_CANCELLED = "Cancelled; frames that are there stay"
 #: Jobs by scene, running or ended: what the panel shows.
 _JOBS: dict[str, Job] = {}
 
@@ -37,6 +38,7 @@ class Job:
                 wait = next(self._steps)
             except StopIteration:
                 self.running = False
+                self.progress.work = _CANCELLED if self.cancelled else self.progress.work
             except BakeError as error:
                 self._fail(str(error), error)
             except Exception as error:  # a mistake of the add-on must not stop Blender's timers in silence
@@ -55,11 +57,19 @@ class Job:
             self.progress.faults.insert(0, Fault(sentence, named.garment, None, named.vertices, named.faces))
 
     def cancel(self) -> None:
-        """End it; finished frames stay."""
+        """End it; finished frames stay. A process is asked to end, and the job goes on until it has."""
+        if not self.running:
+            return
+        self.cancelled = self.progress.cancel = True
+        if not self.progress.runs:
+            self.end()
+
+    def end(self) -> None:
+        """End it now; a process that runs is waited for."""
         if self.running:
-            self.running, self.cancelled = False, True
-            self.progress.work = "Cancelled; the next bake goes on"
+            self.running = False
             self._steps.close()  # type: ignore[attr-defined]
+            self.progress.work = _CANCELLED
 
     def wait(self) -> None:
         """Go on to the end without an interface."""
@@ -90,7 +100,7 @@ def job_of(scene: str) -> Job | None:
 def cancel_all() -> None:
     """End all that runs."""
     for job in _JOBS.values():
-        job.cancel()
+        job.end()
 
 
 def redraw() -> None:

@@ -58,6 +58,8 @@ class Progress:
     total: int = 0
     left: str = ""
     seconds_per_frame: float = 0.0
+    runs: bool = False  # a process, which has to be asked to end
+    cancel: bool = False  # the user wants it to end
     faults: list[Fault] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

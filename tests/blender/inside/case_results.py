@@ -27,7 +27,7 @@ def bake() -> Any:
 
 
 def folder(tmp_path: Path) -> Path:
-    return tmp_path / "hood_cache" / "_scene"
+    return tmp_path / "hood_cache" / "scene"
 
 
 def simulated(tmp_path: Path) -> np.ndarray:
