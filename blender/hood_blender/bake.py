@@ -192,5 +192,5 @@ def _in_blender(plan: Plan, collector: Collector, one: Fault) -> Fault:
         vertices = fault.own_numbers(one.vertices, starts[place], len(exported[place].pos))
         faces = fault.own_numbers(one.faces, face_starts[place], len(exported[place].faces))
     mesh = exported[place]
-    found = Fault(one.text, plan.garments[place].object, one.frame, mesh.originals(vertices), mesh.polygons(faces), one.repair)
-    return found
+    frame = None if one.frame is None else one.frame // collector.captured.samples
+    return Fault(one.text, plan.garments[place].object, frame, mesh.originals(vertices), mesh.polygons(faces), one.repair)

@@ -94,7 +94,16 @@ def faults_in(summary: Path, names: Sequence[str]) -> list[Fault]:
         content = json.loads(summary.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
-    found = [_from_table(row, names) for key in ("faults", "reasons", "doubts") for row in content.get(key) or []]
+    reasons = [row for row in content.get("reasons") or [] if content.get("sound") is not True]
+    rows = [*(content.get("faults") or []), *reasons, *(content.get("doubts") or [])]
+    sentences = {row.get("kind"): row.get("sentence") for row in reversed(rows) if isinstance(row, Mapping) and "sentence" in row}
+    placed = {row.get("kind") for row in content.get("faults") or []}
+    found = []
+    for row in rows:
+        if not isinstance(row, Mapping):
+            found.append(fault_of(str(row), names))
+        elif "sentence" not in row or row.get("kind") not in placed:  # what is placed is not told a second time
+            found.append(_from_table(row, names, sentences.get(row.get("kind"))))
     told = {fault.text for fault in found}
     found += [fault_of(str(text), names) for text in content.get("unsound_reasons") or [] if str(text) not in told]
     unique: dict[tuple[str, str, int | None], Fault] = {}
@@ -103,17 +112,23 @@ def faults_in(summary: Path, names: Sequence[str]) -> list[Fault]:
     return list(unique.values())
 
 
-def _from_table(row: Any, names: Sequence[str]) -> Fault:
-    if not isinstance(row, Mapping):
-        return fault_of(str(row), names)
-    text = str(row.get("sentence") or row.get("text") or row.get("kind") or row)
-    garment = str(row.get("garment") or "") or garment_in(text, names)
+def _from_table(row: Mapping[str, Any], names: Sequence[str], sentence: Any) -> Fault:
+    """A row of the summary; ``sentence`` is what is said of its kind."""
+    kind = str(row.get("kind") or "")
+    fix = f"; {row['fix']}" if row.get("fix") else ""
+    text = str(row.get("sentence") or sentence or kind.replace("_", " ") + fix or row)
     said = numbers_in(text)
-    vertices = _numbers(row, "vertices", "vertex") or [n for pair in row.get("edges") or [] for n in pair] or said["vertices"]
-    faces = _numbers(row, "faces", "triangles", "pairs", "face", "triangle") or said["faces"]
-    frame = row.get("frame", row.get("worst_frame"))
-    repair = _REPAIR_OF.get(str(row.get("kind", "")), "")
-    return Fault(text, garment, frame if isinstance(frame, int) else None, vertices, faces, repair)
+    garment = str(row.get("garment") or "")
+    garment = garment if garment in names else garment_in(text, names)
+    frame = row.get("first_frame", row.get("frame"))
+    return Fault(
+        text,
+        garment,
+        frame if isinstance(frame, int) else None,
+        _numbers(row, "vertices", "vertex", "edges") or said["vertices"],
+        _numbers(row, "triangles", "faces", "pairs") or said["faces"],
+        _REPAIR_OF.get(kind, ""),
+    )
 
 
 def _numbers(row: Mapping[str, Any], *keys: str) -> list[int]:

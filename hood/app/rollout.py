@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hood.app.batch.batch import (
+    STATE,
     Job,
     as_begun,
     find_jobs,
@@ -25,10 +27,20 @@ from hood.app.batch.batch import (
 )
 from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
-from hood.app.output.export import check_outputs, check_worn, export_beside, forms_beside, lay_on, read_textures, remove_earlier
+from hood.app.output.export import (
+    StreamedCaches,
+    check_outputs,
+    check_worn,
+    export_beside,
+    forms_beside,
+    lay_on,
+    read_textures,
+    remove_earlier,
+)
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
+from hood.app.progress import Progress, ProgressFile, find_progress, memories, recall, remembers
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.fabrics import fabric_names
 from hood.app.scene.garments import describe_ease, summarise_ease
@@ -43,12 +55,11 @@ from hood.app.stepping.cloth_contact import why_not
 from hood.app.stepping.guarding import OFF, GuardStopped, guard_sentences, make_guard, write_alarms
 from hood.app.stepping.refinement import exported
 from hood.assets.files.atomic import occupy, write_atomically
-from hood.assets.files.said import Doubt
 from hood.rollouts.file.compact import BodyParameters, make_compact, store_of
 from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.rollouts.file.recorder import RolloutWriter, still_of
 from hood.rollouts.frame import Ease, Frame, measure_ease, metric_names
-from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes
+from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes, still_needed
 from hood.rollouts.loop import simulate
 from hood.scene.sizing import Sizes
 from hood.steppers.newton import Stepper
@@ -190,10 +201,16 @@ def _run_there(
 ) -> tuple[dict[str, Any], bool]:
     """The rollout in its folder, which is there and held; ``body`` gives the body back where it is not stored."""
     config = ready.config
-    remove_earlier(folder, config)
+    scene, stepper = ready.scene, ready.stepper
+    begun = find_progress(folder, asked, digest, scene, stepper) if bool(asked.resume) else None
+    remove_earlier(folder, config, goes_on=begun is not None)
     save_run_record(folder, config, int(config.seed))
-    eases: list[Ease | None] = []
-    interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned.doubts, bar)
+    eases: list[Ease | None] = [] if begun is None else list(begun.eases)
+    warned += [] if begun is None else [sentence for sentence in begun.warnings if sentence not in warned]
+    kept = ProgressFile(folder, scene, stepper)
+    caches = StreamedCaches(folder / "rollout.h5", forms_beside(config), read_textures(config))
+    with closing(caches):
+        interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned, bar, caches, kept, begun)
     data = read_rollout(folder / "rollout.h5")
     if not interrupted:
         make_compact(folder / "rollout.h5", store_of(config.formats), body)
@@ -203,15 +220,19 @@ def _run_there(
             judged = beside.submit(summarise, data)
             if not interrupted:
                 _draw(config, data, folder, bar)
-                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config))
+                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config), caches)
     finally:
         summary = _conclude(ready, folder, data, judged.result(), eases, advise)
         summary["warnings"] = list(warned)
         _write_json(folder / "summary.json", summary)
+    if not interrupted:
+        kept.remove()
     _tell(exported)
     say(f"files in {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     if interrupted:
-        say(f"hood: interrupted; the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}", error=True)
+        there = f"the {summary['num_frames']} frames done are kept in {folder / 'rollout.h5'}"
+        on = "; the same command with resume=true goes on" if (folder / STATE).exists() else ""
+        say(f"hood: interrupted; {there}{on}", error=True)
     return summary, interrupted
 
 
@@ -262,13 +283,24 @@ def _run_all(config: RolloutSettings, jobs: list[Job], output: Path, bar: Bar) -
 
 
 def _simulate_to_disk(
-    ready: Setup, digest: str, path: Path, asked: RolloutSettings, eases: list[Ease | None], doubts: Sequence[Doubt], bar: Bar
+    ready: Setup,
+    digest: str,
+    path: Path,
+    asked: RolloutSettings,
+    eases: list[Ease | None],
+    warned: Heard,
+    bar: Bar,
+    caches: StreamedCaches,
+    kept: ProgressFile,
+    begun: Progress | None,
 ) -> bool:
-    """Stream the rollout into ``path``; True when the user interrupted it. ``asked`` is the config with ``auto`` in it,
-    ``doubts`` those about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning
-    and the end."""
+    """Stream the rollout into ``path`` and ``caches``, and into ``kept`` where it is; True when the user interrupted it. What
+    was ``begun`` goes on. ``asked`` is the config with ``auto`` in it, ``warned`` holds the doubts about its inputs. Where a
+    size was asked for, how the garment sat is added to ``eases``, at the beginning and the end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
+    if begun is not None:
+        recall(begun, path.parent, guard)
     measured, (settle, relaxing) = measurement(config), start_of(config)
     count = min(int(config.num_frames), scene.num_frames)
     if count < int(config.num_frames):
@@ -286,7 +318,7 @@ def _simulate_to_disk(
         "surface_stride": measured.surface_every,
         "cloth_contact_off": why_not(config),
         "guard": OFF if guard is None else guard.mode,
-        "doubts": [doubt.as_dict() for doubt in doubts],
+        "doubts": [doubt.as_dict() for doubt in warned.doubts],
         **motion_attributes(str(config.sequence)),
         **fastening_attributes(scene),
     }
@@ -316,6 +348,8 @@ def _simulate_to_disk(
         guarded=guard is not None,
         still=ridden_still(still, riders),
         steps=steps,
+        done=None if begun is None else begun.done,
+        goes_on=not remembers(stepper),
     )
     frames = simulate(
         stepper,
@@ -329,24 +363,32 @@ def _simulate_to_disk(
         settle=settle,
         guard=guard,
         afresh=plan_mode(config) == "full",
+        after=None if begun is None else begun.frame,
+        goal=None if begun is None else begun.goal,
     )
+    given, known = (0, ()) if begun is None else (begun.done.frames, begun.known)
+    left = count if begun is None else count - 1 - begun.frame.index
 
     def simulated() -> Iterator[Frame]:
         """The simulated frames, each noted before it is passed on."""
-        for frame in bar(frames, count, f"rollout {scene.garment.name}"):
+        recent = list(known)
+        for frame in bar(frames, left, f"rollout {scene.garment.name}"):
             if steps is not None:
                 writer.append_step(frame.world_pos.numpy(), frame.metrics)
             if scene.sizes != Sizes() and frame.index in (0, count - 1):
                 eases.append(measure_ease(scene, scene.cloth_at(frame.index), frame.state, frame.index))
             yield frame
             write_alarms(writer, guard)
+            recent = [] if steps is None else still_needed([*recent, frame], steps.rate, writer.frames_done)
+            kept.keep(Progress(frame, writer.done, recent, *memories(guard, stepper), tuple(eases), tuple(warned)))
 
     try:
         with writer:
-            shown = on_finer_mesh(at_output_fps(simulated(), config, scene, count), finer, scene)
+            shown = on_finer_mesh(at_output_fps(simulated(), config, scene, count, given=given, known=known), finer, scene)
             for frame in ridden_frames(shown, garment):
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
+                caches.append(frame.world_pos.numpy(), frame.body_pos.numpy())
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped
@@ -355,7 +397,12 @@ def _simulate_to_disk(
     except KeyboardInterrupt:
         if writer.frames_done == 0:
             raise
+        kept.write_last()
         return True
+    except OSError:
+        if kept.write_last():
+            say(f"hood: {writer.frames_done} frames are kept in {path}; the same command with resume=true goes on", error=True)
+        raise
     return False
 
 

@@ -41,6 +41,7 @@ class Frame:
     metrics: dict[str, float]
     fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
     simulated: bool = True  # False: between two simulated frames, see :mod:`hood.rollouts.frames`
+    far: bool = False  # the step that led here ended far from its minimum: the next one is measured too
 
 
 #: What is measured of a frame besides its time and what the stepper reports: strain, penetration, cut surface and energies,

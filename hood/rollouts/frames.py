@@ -69,7 +69,12 @@ _AROUND = 2
 
 
 def output_frames(
-    frames: Iterable[Frame], rate: OutputRate, jumps: Collection[int] = (), body: Callable[[int], Tensor] | None = None
+    frames: Iterable[Frame],
+    rate: OutputRate,
+    jumps: Collection[int] = (),
+    body: Callable[[int], Tensor] | None = None,
+    given: int = 0,
+    known: Iterable[Frame] = (),
 ) -> Iterator[Frame]:
     """Frames at ``rate`` of simulated ones, 0, 1, …, as soon as they are known; six simulated frames are kept at most.
 
@@ -87,19 +92,25 @@ def output_frames(
             is given; nothing is interpolated across.
         body: the body's surface (W, 3) [m], float64, world, in the frame of this number, where it is not a simulated one;
             None: the body is interpolated as the cloth is.
+        given: so many frames were given before; this goes on after them.
+        known: the simulated frames before ``frames`` that these need (:func:`still_needed`).
     """
-    kept: dict[int, Frame] = {}
-    index = 0
+    kept = {frame.index: frame for frame in known}
+    index = given
     for frame in frames:
         kept[frame.index] = frame
         while _is_known(rate, index, frame.index, over=False):
             yield _frame_at(kept, rate, index, jumps, body)
             index += 1
-        for old in [number for number in kept if number < rate.place(index)[0] - _AROUND]:
-            del kept[old]
+        kept = {one.index: one for one in still_needed(kept.values(), rate, index)}
     while kept and _is_known(rate, index, max(kept), over=True):
         yield _frame_at(kept, rate, index, jumps, body)
         index += 1
+
+
+def still_needed(frames: Iterable[Frame], rate: OutputRate, given: int) -> list[Frame]:
+    """Those of simulated frames that frames after the ``given`` ones are made of."""
+    return [frame for frame in frames if frame.index >= rate.place(given)[0] - _AROUND]
 
 
 def hermite(start: Tensor, end: Tensor, start_slope: Tensor, end_slope: Tensor, share: float) -> tuple[Tensor, Tensor]:

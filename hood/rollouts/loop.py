@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,6 +76,8 @@ def simulate(
     guard: Guard | None = None,
     afresh: bool = False,
     start: State | None = None,
+    after: Frame | None = None,
+    goal: Mapping[str, Any] | None = None,
 ) -> Iterator[Frame]:
     """Frames 0, 1, … of the garment on the moving body.
 
@@ -103,6 +106,10 @@ def simulate(
 
     ``start`` is frame 0, where it is given; ``settle`` plays no role then.
 
+    ``after`` is a frame that this has given before, with everything as it was then: the frames from the next one on are given.
+    They are the same to the bit where the ``guard`` knows what it knew (:meth:`Guard.recall`), and a refinement, by ``goal``,
+    what it had learned (:attr:`hood.steppers.refined.RefinedStepper.learned`).
+
     ``afresh``: no search begins with what the step before found. The frames are the same, and take longer.
 
     A ``guard`` sees every step from frame to frame, but for a relaxing one. The rollout goes on with what it makes of the step,
@@ -127,9 +134,15 @@ def simulate(
     if network is not None:
         network.use_potential(for_networks(potential))
     prepared = prepare_stepper(stepper, scene)
+    if goal is not None and isinstance(stepper, RefinedStepper):
+        stepper.recall(goal)
+    if after is not None and scene.sizes.changing:  # what is kept of a cloth, as its layers, is of its size at first
+        step = scene.step_input(start_frame + after.index, after.state)
+        gravity = stepper.gravity.to(after.state.pos)
+        stepper.search(potential.prepare(StepProblem(scene.cloth, after.state, step, gravity=gravity)))
     rest = None
-    if start is not None:
-        state = start
+    if after is not None or start is not None:
+        state = start if after is None else after.state
     elif settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
         state, rest = rest_state(stepper, scene, potential, relaxing_steps, start_frame, attachments)
     else:
@@ -140,10 +153,11 @@ def simulate(
     wants_potential = metrics == "all" or bool(fields)
     meter = SurfaceMeter(scene.garment, scene.motion.faces) if metrics == "all" else None
     jumps = _jumps_within(scene, start_frame, count)
-    watch, cloth, far = Stopwatch(), scene.cloth, False
-    for index in range(count):
+    watch, cloth, far = Stopwatch(), scene.cloth, after is not None and after.far
+    first = -1 if after is None else after.index
+    for index in range(max(first, 0), count):
         body_frame = start_frame + index
-        state = recentre(state, scene.cloth.vertex_scene)
+        state = state if index == first else recentre(state, scene.cloth.vertex_scene)
         problem, here = None, cloth
         if afresh:
             forget_searches()
@@ -162,18 +176,20 @@ def simulate(
                 problem = stepper.search(problem)
         with watch.aside("metrics"):
             known = potential.prepare(problem) if problem is not None and wants_potential else problem
-            row = {**_state_metrics(scene, here, state, body_frame, known, metrics), **stepped}
-            if meter is not None and _is_measured(index, count, surface_stride):
-                row |= _surface_now(meter, scene, state, body_frame)
-        row["ms_metrics"] = watch.spent_aside("metrics")
-        if guard is not None and index > 0:
-            guard.see_surface(index, row)
-            if guard.stopped is not None:
-                return
-        with watch.aside("caller"):
-            origin = state.origin[0]
-            body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
-            yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row, known_fields)
+        if index != first:
+            with watch.aside("metrics"):
+                row = {**_state_metrics(scene, here, state, body_frame, known, metrics), **stepped}
+                if meter is not None and _is_measured(index, count, surface_stride):
+                    row |= _surface_now(meter, scene, state, body_frame)
+            row["ms_metrics"] = watch.spent_aside("metrics")
+            if guard is not None and index > 0:
+                guard.see_surface(index, row)
+                if guard.stopped is not None:
+                    return
+            with watch.aside("caller"):
+                origin = state.origin[0]
+                body_pos = scene.motion.surface(body_frame, origin.numpy()).cpu().double() + origin
+                yield Frame(index, state, state.pos.cpu().double() + origin, body_pos, row, known_fields, far=far)
         if problem is None or known is None:
             return
         prediction, lap, figures = stepper.predict(problem, prepared, watch), watch.lap(), None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -133,6 +134,23 @@ class RefinedStepper:
     def begin_rollout(self) -> None:
         """Forget what the goal has learned in the last one."""
         self.goal = deepcopy(self._fresh_goal)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether beside its inner stepper it remembers what its goal has learned alone."""
+        return self._minimizer is None and type(self.goal).__module__ == StoppingCriterion.__module__
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """What the goal has learned in this rollout, as numbers and lists of numbers."""
+        known = {name: list(value) if isinstance(value, deque) else value for name, value in vars(self.goal).items()}
+        return {name: value for name, value in known.items() if isinstance(value, (bool, int, float, list))}
+
+    def recall(self, learned: Mapping[str, Any]) -> None:
+        """Go on with what :attr:`learned` was."""
+        for name, value in learned.items():
+            own = getattr(self.goal, name)
+            setattr(self.goal, name, deque(value, maxlen=own.maxlen) if isinstance(own, deque) else value)
 
     def search(self, problem: StepProblem) -> StepProblem:
         """The problem with what the inner stepper and the potential's terms ask of it."""

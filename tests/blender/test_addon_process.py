@@ -65,15 +65,24 @@ def test_numbers_in_a_sentence_can_be_selected() -> None:
 def test_faults_of_a_summary_are_rows_with_garment_frame_and_numbers(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     assert fault.faults_in(path, NAMES) == []
-    reasons = [{"kind": "cloth_through_cloth", "sentence": "coat: pieces cross", "frame": 4, "pairs": [[1, 5], [2, 5]]}]
-    doubts = [{"kind": "frame_rate", "sentence": "no rate", "vertices": [7]}, {"sentence": "edges", "edges": [[1, 2]]}]
-    content = {"reasons": reasons, "unsound_reasons": ["coat: pieces cross", "slip: off"], "doubts": doubts}
+    placed = [
+        {"kind": "cloth_through_cloth", "garment": "coat", "first_frame": 4, "frames": [[4, 6]], "triangles": [1, 5], "fix": None},
+        {"kind": "distance", "garment": "slip", "first_frame": 0, "frames": [[0, 1]], "vertices": [3], "fix": "solve further"},
+    ]
+    reasons = [{"kind": "cloth_through_cloth", "sentence": "pieces cross in 3 frames", "frames": [[4, 6]]}]
+    doubts = [{"kind": "frame_rate", "sentence": "no rate"}, {"kind": "x", "sentence": "coat: edges", "edges": [[1, 2]]}]
+    content = {"sound": False, "faults": placed, "reasons": reasons, "doubts": doubts}
+    content["unsound_reasons"] = ["pieces cross in 3 frames", "slip: off"]
     path.write_text(json.dumps(content))
-    first, second, third, last = fault.faults_in(path, NAMES)
-    assert (first.garment, first.frame, first.faces, first.repair) == ("coat", 4, [1, 5, 2], "settle")
-    assert second.vertices == [7]
-    assert third.vertices == [1, 2]
+    first, second, third, fourth, last = fault.faults_in(path, NAMES)
+    assert (first.text, first.garment, first.frame, first.faces) == ("pieces cross in 3 frames", "coat", 4, [1, 5])
+    assert first.repair == "settle"
+    assert (second.text, second.garment, second.vertices) == ("distance; solve further", "slip", [3])
+    assert (third.text, third.garment) == ("no rate", "")
+    assert (fourth.garment, fourth.vertices) == ("coat", [1, 2])
     assert (last.text, last.garment) == ("slip: off", "slip")
+    path.write_text(json.dumps(content | {"sound": True, "faults": [], "unsound_reasons": []}))
+    assert [found.text for found in fault.faults_in(path, NAMES)] == ["no rate", "coat: edges"]  # too rare to count
     path.write_text("{")
     assert fault.faults_in(path, NAMES) == []
 

@@ -39,6 +39,8 @@ from hood.rollouts.file.reader import read_rollout
 from hood.training import distributed
 
 _NAME = "summary.json"
+#: Beside a rollout that is not whole: where it was stopped (:mod:`hood.app.progress`).
+STATE = "rollout.state"
 #: Seconds to wait for another call that writes its rows at this moment.
 _PATIENCE = 20.0
 
@@ -318,8 +320,8 @@ _FREE = ("resume", "output", "root", "fail_on", "sequence")
 
 
 def as_begun(config: RolloutSettings, motions: Iterable[tuple[str, Path]]) -> RolloutSettings:
-    """With ``resume=true stepper=auto`` the config with the stepper of the first rollout that is finished with all its other
-    settings: what was begun with one stepper, or when another was the default, goes on with that.
+    """With ``resume=true stepper=auto`` the config with the stepper of the first rollout that is finished, or was stopped, with
+    all its other settings: what was begun with one stepper, or when another was the default, goes on with that.
 
     Args:
         motions: of each the motion and the folder.
@@ -327,11 +329,11 @@ def as_begun(config: RolloutSettings, motions: Iterable[tuple[str, Path]]) -> Ro
     if not bool(config.resume) or str(config.stepper) != AUTO:
         return config
     for sequence, folder in motions:
-        attributes = _complete(folder)
+        attributes = _complete(folder, or_stopped=True)
         if attributes is None or str(attributes["stepper"]) not in options(GROUP):  # of a plugin that is gone
             continue
         same = with_stepper(config, str(attributes["stepper"]))
-        if not _other_settings(same.with_values(sequence=sequence), attributes):
+        if not other_settings(same.with_values(sequence=sequence), attributes):
             say(f"resume=true: stepper={same.stepper}, as in {folder}")
             return same
     return config
@@ -356,7 +358,7 @@ def finished(config: RolloutSettings, digest: str, folder: Path) -> dict[str, An
         summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    if attributes is None or attributes["checkpoint_sha256"] != digest or _other_settings(config, attributes):
+    if attributes is None or attributes["checkpoint_sha256"] != digest or other_settings(config, attributes):
         return None
     return summary if {"sound", "doubts"} <= set(summary) else summarise(read_rollout(folder / "rollout.h5"))
 
@@ -364,21 +366,23 @@ def finished(config: RolloutSettings, digest: str, folder: Path) -> dict[str, An
 def made_otherwise(config: RolloutSettings, folder: Path) -> str | None:
     """A sentence where the folder has a whole rollout of the motion with another setting; None where it has none."""
     attributes = _complete(folder)
-    found = {} if attributes is None else _other_settings(config, attributes)
+    found = {} if attributes is None else other_settings(config, attributes)
     for key, there in found.items():
         here = f"{key} is {brief(there)} there, {brief(config[key])} in this command"
         return f"resume=true: {folder} was made with other settings and is made again ({here})"
     return None
 
 
-def _complete(folder: Path) -> dict[str, Any] | None:
-    """Attributes of the whole rollout in a folder; None where there is none."""
+def _complete(folder: Path, or_stopped: bool = False) -> dict[str, Any] | None:
+    """Attributes of the whole rollout in a folder, ``or_stopped`` also of one that can go on; None where there is none."""
     attributes = attributes_of(folder)
-    known = attributes is not None and {"asked", "complete", "checkpoint_sha256", "stepper"} <= {*attributes}
-    return attributes if attributes is not None and known and bool(attributes["complete"]) else None
+    if attributes is None or not {"asked", "complete", "checkpoint_sha256", "stepper"} <= {*attributes}:
+        return None
+    goes_on = or_stopped and (folder / STATE).is_file()
+    return attributes if bool(attributes["complete"]) or goes_on else None
 
 
-def _other_settings(config: Any, attributes: dict[str, Any]) -> dict[str, Any]:
+def other_settings(config: Any, attributes: dict[str, Any]) -> dict[str, Any]:
     """What a rollout was made with where that is not what ``config`` says, by key."""
     try:
         before = read_settings(attributes["asked"])

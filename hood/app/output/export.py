@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from omegaconf import DictConfig
 
+from hood.app.batch.batch import STATE
 from hood.app.common import frame_count, split_words
 from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.app.settings.rollout_settings import Settings
@@ -25,7 +26,15 @@ from hood.assets.files.said import install
 from hood.assets.formats.image import Texture, read_texture
 from hood.assets.garment.garment import Garment
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd
-from hood.media.exports.sequences import PARTS, Clip, clip_of, write_obj_sequence, write_ply_sequence, write_point_cache
+from hood.media.exports.sequences import (
+    PARTS,
+    Clip,
+    PointCacheFiles,
+    clip_of,
+    write_obj_sequence,
+    write_ply_sequence,
+    write_point_cache,
+)
 from hood.media.pieces import GarmentPiece, layer_distances, pieces_by, pieces_of, plain_name
 from hood.rollouts.file.compact import STORES
 from hood.rollouts.file.reader import RolloutData, read_rollout
@@ -96,11 +105,14 @@ def _check_textured(textures: Mapping[str, Texture], forms: Sequence[str], key: 
         raise ConfigError(f"texture: {asked} shows no images; take {key}={' or '.join(_TEXTURED)}, or hood view")
 
 
-def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Texture]) -> list[str]:
+def export_beside(
+    source: Path, forms: Sequence[str], textures: Mapping[str, Texture], streamed: StreamedCaches | None = None
+) -> list[str]:
     """Write all of the rollout ``source`` in every format beside it, in place of what an earlier run has left there.
 
     Args:
         textures: images of garments, of :func:`read_textures`.
+        streamed: what was written while it was made; whole point caches stay as they are.
 
     Returns:
         A sentence about each.
@@ -108,7 +120,55 @@ def export_beside(source: Path, forms: Sequence[str], textures: Mapping[str, Tex
     if not forms:
         return []
     data = read_checked(source, "fabric")
-    return [_export(source, data, _beside(source, form), form, textures, _Wanted(), True) for form in forms]
+    said = []
+    for form in forms:
+        there = form == "pc2" and streamed is not None and streamed.holds(data)
+        said.append(_export(source, data, _beside(source, form), form, textures, _Wanted(), None if there else True))
+    return said
+
+
+class StreamedCaches:
+    """The point caches of ``formats=[pc2]``, written while the rollout ``source`` is made.
+
+    They have the bytes that :func:`export_beside` writes when it is over. With the layouts of ``rollout.h5`` that keep
+    positions in steps it does write them, from these; and where a frame is not finite, it says so.
+
+    Args:
+        forms: the formats that are asked for; without pc2 nothing is written.
+        textures: images of garments, of :func:`read_textures`.
+    """
+
+    def __init__(self, source: Path, forms: Sequence[str], textures: Mapping[str, Texture]) -> None:
+        self._source, self._textures = source, textures
+        self._files: PointCacheFiles | None = None
+        self._ended = "pc2" not in forms
+
+    def append(self, cloth_pos: np.ndarray, body_pos: np.ndarray) -> None:
+        """Write the last frame of ``source``, whose positions (V, 3) and (W, 3) [m] these are; before the first one, and where
+        they need another origin, all frames that are there.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        if self._ended or (self._files is not None and self._files.append(cloth_pos, body_pos)):
+            return
+        self.close()
+        if not (np.isfinite(cloth_pos).all() and np.isfinite(body_pos).all()):
+            self._ended = True
+            return
+        data, target = read_checked(self._source, "fabric"), _beside(self._source, "pc2")
+        _write(target, "pc2", clip_of(data, textures=lay_on(self._textures, [data])[0]), "y", replace=True)
+        self._files = PointCacheFiles(target, data)
+
+    def holds(self, data: RolloutData) -> bool:
+        """Whether the files hold all of ``data``, as they are to be."""
+        whole = self._files is not None and not self._ended and self._files.num_frames == len(data.time)
+        return whole and str(data.attributes.get("store", "")) == ""
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._files is not None:
+            self._files.close()
 
 
 def _export(
@@ -118,13 +178,14 @@ def _export(
     form: str,
     textures: Mapping[str, Texture],
     wanted: _Wanted,
-    replace: bool = False,
+    replace: bool | None = False,
 ) -> str:
-    """Write one format; what there is to say of it."""
+    """Write one format, but for ``replace=None``, where it is there; what there is to say of it."""
     layers = None if wanted.thickness == 0 else layer_distances(data, wanted.thickness)
     try:
         clip = clip_of(data, wanted.parts, wanted.num_frames, wanted.up, lay_on(textures, [data])[0], layers)
-        _write(target, form, clip, wanted.up, replace)
+        if replace is not None:
+            _write(target, form, clip, wanted.up, replace)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
     names = ", ".join(f"{part.name} ({part.pos.shape[1]} vertices)" for part in clip.parts)
@@ -283,14 +344,17 @@ def read_checked(path: Path, colour: str) -> RolloutData:
 _NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "plan.json")
 
 
-def remove_earlier(folder: Path, config: Settings) -> None:
-    """Remove summary, pictures, exports and plan of the rollout that was in ``folder``: they would pass for the next one's.
+def remove_earlier(folder: Path, config: Settings, goes_on: bool = False) -> None:
+    """Remove summary, pictures, exports, plan and state of the rollout that was in ``folder``: they would pass for the next
+    one's. Of one that ``goes_on`` the state and the point caches stay.
 
     The summary goes first: its presence says that everything is there. What ``config`` names as input stays.
     """
     given = {Path(word).expanduser().resolve() for word in _words(plain(config))}
-    for path in (*(folder / name for name in _NAMES), *exports_beside(folder / "rollout.h5")):
-        if path.resolve() not in given:
+    source = folder / "rollout.h5"
+    kept = {folder / STATE, _beside(source, "pc2")} if goes_on else set()
+    for path in (*(folder / name for name in _NAMES), *exports_beside(source), folder / STATE):
+        if path.resolve() not in given and path not in kept:
             remove_whole(path)
 
 

@@ -54,15 +54,23 @@ def output_rate(config: RolloutSettings) -> OutputRate | None:
 
 
 def at_output_fps(
-    frames: Iterable[Frame], config: RolloutSettings, scene: Scene, count: int, own: Own = NAMED
+    frames: Iterable[Frame],
+    config: RolloutSettings,
+    scene: Scene,
+    count: int,
+    own: Own = NAMED,
+    given: int = 0,
+    known: Iterable[Frame] = (),
 ) -> Iterator[Frame]:
-    """The frames to store of ``count`` simulated ones: all of them where there is no ``output_fps``."""
+    """The frames to store of ``count`` simulated ones: all of them where there is no ``output_fps``. ``given`` and ``known`` as
+    in :func:`hood.rollouts.frames.output_frames`."""
     rate = output_rate(config)
     if rate is None:
         yield from frames
         return
     jumps = find_jumps(scene.motion, 1.0 / scene.dt)
-    yield from output_frames(frames, rate, jumps, None if rate.whole else _posed(config, scene, rate.count(count), own))
+    body = None if rate.whole else _posed(config, scene, rate.count(count), own)
+    yield from output_frames(frames, rate, jumps, body, given, known)
 
 
 def planned_steps(config: RolloutSettings, scene: Scene, count: int) -> StepPlan | None:

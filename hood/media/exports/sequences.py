@@ -6,10 +6,12 @@ Moving meshes as other programs know them: named parts, a frame rate, one origin
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -92,6 +94,72 @@ def write_point_cache(folder: Path, clip: Clip) -> None:
         # Version, points, first frame, frames from one sample to the next, samples.
         header = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, part.pos.shape[1], 0.0, 1.0, clip.num_frames)
         (folder / f"{part.name}.pc2").write_bytes(header + np.ascontiguousarray(part.pos, "<f4").tobytes())
+
+
+#: Where the head of a point cache says how many frames there are.
+_SAMPLES = 28
+
+
+class PointCacheFiles:
+    """The point caches of :func:`write_point_cache`, open for further frames of a rollout that is being made.
+
+    Frames are on the disk before the head of a file counts them: whoever opens it meanwhile, as Blender's modifier Mesh Cache
+    does, finds whole frames.
+
+    Args:
+        folder: where they were written.
+        data: what they were written from, by :func:`clip_of` without a thickness.
+    """
+
+    def __init__(self, folder: Path, data: RolloutData) -> None:
+        clip = clip_of(data)
+        self.num_frames, self._origin = clip.num_frames, clip.origin
+        self._vertices = [piece.vertices for piece in pieces_of(data)]
+        self._kinds = data.cloth_pos.dtype, data.body_pos.dtype
+        self._is_far = max(_farthest(part.pos) for part in clip.parts) > _FAR
+        self._files = [open(folder / f"{part.name}.pc2", "r+b") for part in clip.parts]
+
+    def append(self, cloth_pos: np.ndarray, body_pos: np.ndarray) -> bool:
+        """Write one frame, positions (V, 3) and (W, 3) [m] as the rollout's file is given them.
+
+        Returns:
+            Whether the files hold it. Not one that is not finite, nor the first that lies so far away that all frames are
+            to be written from an origin of their own.
+
+        Raises:
+            OSError: the disk refuses; names the file.
+        """
+        cloth, body = (np.asarray(pos, kind) for pos, kind in zip((cloth_pos, body_pos), self._kinds, strict=True))
+        parts = [cloth[vertices] for vertices in self._vertices] + [body] * bool(len(body))
+        farther = not self._is_far and max(map(_farthest, parts)) > _FAR
+        if farther or not all(np.isfinite(pos).all() for pos in parts):
+            return False
+        for file, pos in zip(self._files, parts, strict=True):
+            _put(file, np.ascontiguousarray(pos.astype(np.float64) - self._origin, "<f4").tobytes())
+        self.num_frames += 1
+        for file in self._files:
+            _put(file, struct.pack("<i", self.num_frames), _SAMPLES)
+        return True
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files:
+            file.close()
+
+
+def _put(file: BinaryIO, content: bytes, place: int | None = None) -> None:
+    """Write at ``place``, or behind the end; it is with the system then."""
+    try:
+        file.seek(0, os.SEEK_END) if place is None else file.seek(place)
+        file.write(content)
+        file.flush()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, file.name) from error
+
+
+def _farthest(pos: np.ndarray) -> float:
+    """Largest coordinate [m]."""
+    return float(np.abs(pos).max(initial=0.0))
 
 
 def _obj_points(part: ClipPart, frame: int) -> str:
@@ -189,7 +257,7 @@ def clip_of(
         if broken.any():
             frame = int(broken.argmax())
             raise ValueError(f"{mesh.name} has no finite position in frame {frame}; give num_frames={frame} or less")
-    farthest = max(float(np.abs(mesh.pos).max(initial=0.0)) for mesh in meshes)
+    farthest = max(_farthest(mesh.pos) for mesh in meshes)
     origin = np.round(meshes[0].pos[0].astype(np.float64).mean(axis=0)) if farthest > _FAR else np.zeros(3)
     moved = (np.asarray(mesh.pos, np.float64) - origin for mesh in meshes)
     turned = (replace(mesh, pos=_upright(pos, up)) for mesh, pos in zip(meshes, moved, strict=True))

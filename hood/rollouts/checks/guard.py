@@ -46,9 +46,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import Any
 
 import torch
 
@@ -167,6 +168,17 @@ class Guard:
         self._calm: deque[float] = deque(maxlen=_WINDOW)
         self._strain_limit = STRAIN_LIMIT
         self._checked_strain = 0.0
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """What its limits depend on beside its arguments; alarms do not."""
+        return {"calm": list(self._calm), "strain_limit": self._strain_limit, "checked_strain": self._checked_strain}
+
+    def recall(self, memory: Mapping[str, Any], alarms: Iterable[Mapping[str, Any]]) -> None:
+        """Go on with what :attr:`memory` was, after ``alarms``, each with the names of :class:`Alarm`."""
+        self._calm.extend(memory["calm"])
+        self._strain_limit, self._checked_strain = memory["strain_limit"], memory["checked_strain"]
+        self.alarms += [Alarm(**alarm) for alarm in alarms]
 
     @property
     def stopped(self) -> Alarm | None:

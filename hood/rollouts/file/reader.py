@@ -136,7 +136,7 @@ def read_rollout(path: Path | str, body: Body | None = None) -> RolloutData:
                 metrics={name.removeprefix("metrics/"): file[name][:done] for name in _metric_paths(file)},
                 attributes=dict(file.attrs),
                 fields={name.removeprefix("cloth/"): file[name][:done] for name in _field_paths(file)},
-                alarms=_read_alarms(file),
+                alarms=alarms_in(file),
                 still={name.removeprefix("cloth/"): file[name][:] for name in _still_paths(file)},
                 steps=read_steps(file, len(file["cloth/rest_pos"])),
             )
@@ -188,7 +188,7 @@ def _check_refined(file: h5py.File) -> None:
         )
 
 
-def _read_alarms(file: h5py.File) -> list[dict[str, Any]]:
+def alarms_in(file: h5py.File) -> list[dict[str, Any]]:
     paths = _alarm_paths(file)
     if any(f"guard/{name}" not in paths for name in ALARM_COLUMNS):
         return []

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -68,6 +68,14 @@ def still_of(garment: Garment, fastening: Fastening | None = None, cloth: Cloth 
     return {**found, "uv": garment.uv, "uv_faces": garment.faces if garment.uv_faces is None else garment.uv_faces}
 
 
+class Done(NamedTuple):
+    """How much of a rollout file was done: frames, simulated ones where these have tables of their own, and alarms."""
+
+    frames: int
+    steps: int
+    alarms: int
+
+
 class RolloutWriter:
     """Streams a rollout into an HDF5 file.
 
@@ -98,6 +106,9 @@ class RolloutWriter:
 
     With ``steps`` the stored frames are not the simulated ones: these have tables of their own
     (:class:`hood.rollouts.file.step_table.StepTable`), and alarms count them.
+
+    With ``done`` the file at ``path`` is of the same rollout, stopped: so much of it is taken over, and the new file takes its
+    place. Where it ``goes_on`` later, frames stay where the disk refuses further ones; else the file goes away then.
     """
 
     def __init__(
@@ -117,11 +128,17 @@ class RolloutWriter:
         guarded: bool = False,
         still: Mapping[str, np.ndarray] | None = None,
         steps: StepPlan | None = None,
+        done: Done | None = None,
+        goes_on: bool = False,
     ) -> None:
-        self.path = path
+        self.path, self._goes_on = path, goes_on
         self.frames_done = self.alarms_done = 0
         # Windows does not rename a file that is open.
         self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
+        before = path
+        if done is not None and self._draft == path:
+            before = path.with_name(path.name + ".before")
+            os.replace(path, before)
         try:
             self._file = h5py.File(self._draft, "w")
         except OSError as error:
@@ -149,8 +166,12 @@ class RolloutWriter:
             self._touch_all()
             by_frame = ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file))
             self._rows = {name: RowWriter(self._file[name]) for name in by_frame}
+            if done is not None:
+                self._take_over(before, done)
             self._file.flush()
             self._take_name()
+            if before != path:
+                before.unlink()
         except OSError as error:
             self._discard(self._draft)
             raise _plain_error(error, path) from error
@@ -184,6 +205,11 @@ class RolloutWriter:
         assert self._steps is not None
         self._steps.append(cloth_pos, metrics)
 
+    @property
+    def done(self) -> Done:
+        """How much of the file is done."""
+        return Done(self.frames_done, 0 if self._steps is None else self._steps.done, self.alarms_done)
+
     def append_alarms(self, alarms: Sequence[Mapping[str, Any]]) -> None:
         """Write further alarms, each with the names of :data:`ALARM_COLUMNS`."""
         for alarm in alarms:
@@ -210,12 +236,36 @@ class RolloutWriter:
         """Close and delete the file: nothing half-written stays behind."""
         self._discard(self.path)
 
+    def _leave(self) -> None:
+        """Close the file as a killed process leaves it: to cut it would take space."""
+        try:
+            self._file.close()
+        except (OSError, RuntimeError):
+            pass
+
     def _discard(self, path: Path) -> None:
         try:
             self._file.close()
         except (OSError, RuntimeError):
             pass  # a full disk refuses the final flush too; the file goes away anyway
         path.unlink(missing_ok=True)
+
+    def _take_over(self, before: Path, done: Done) -> None:
+        """Copy what is done from the file of before, and count it."""
+        target = self._file
+        with h5py.File(before, "r") as source:
+            for name in ("cloth/pos", "body/pos", *_field_paths(target), *_metric_paths(target)):
+                _copy_rows(source[name], target[name], done.frames)
+            for name in step_paths(target):
+                _copy_rows(source[name], target[name], done.steps)
+            for name in _alarm_paths(target):
+                _copy_rows(source[name], target[name], done.alarms)
+        self.frames_done, self.alarms_done = done.frames, done.alarms
+        target.attrs.modify("num_frames", done.frames)
+        if "num_alarms" in target.attrs:
+            target.attrs.modify("num_alarms", done.alarms)
+        if self._steps is not None:
+            self._steps.begin_after(done.steps)
 
     def _take_name(self) -> None:
         """Let others read: the layout is on the disk, the file has its name and HDF5's lock on it is given back."""
@@ -241,12 +291,24 @@ class RolloutWriter:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if isinstance(error, OSError) or self.frames_done == 0:
+        if self.frames_done == 0 or (isinstance(error, OSError) and not self._goes_on):
             self.discard()
-            if isinstance(error, OSError):
-                raise _plain_error(error, self.path) from error
+        elif isinstance(error, OSError):
+            self._leave()
         else:
             self.close(complete=error is None)
+        if isinstance(error, OSError):
+            raise _plain_error(error, self.path if error.filename is None else Path(error.filename)) from error
+
+
+#: Rows that are copied at once.
+_COPIED = 64
+
+
+def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, count: int) -> None:
+    for first in range(0, count, _COPIED):
+        last = min(first + _COPIED, count)
+        target[first:last] = source[first:last]
 
 
 def _frames_there(file: h5py.File) -> int:

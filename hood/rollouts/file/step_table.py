@@ -129,6 +129,11 @@ class StepTable:
         file.attrs.update(own)
         self._rows = {name: RowWriter(file[name]) for name in step_paths(file)}
 
+    def begin_after(self, done: int) -> None:
+        """Go on after so many rows, which somebody has copied."""
+        self.done = done
+        self._file.attrs.modify("num_steps", done)
+
     def append(self, cloth_pos: np.ndarray, metrics: Mapping[str, float]) -> None:
         """Write one simulated frame: positions (V, 3) [m], world, and its metrics."""
         for name, value in metrics.items():
