@@ -96,7 +96,9 @@ def faults_in(summary: Path, names: Sequence[str]) -> list[Fault]:
         return []
     reasons = [row for row in content.get("reasons") or [] if content.get("sound") is not True]
     rows = [*(content.get("faults") or []), *reasons, *(content.get("doubts") or [])]
-    sentences = {row.get("kind"): row.get("sentence") for row in reversed(rows) if isinstance(row, Mapping) and "sentence" in row}
+    sentences = {
+        row.get("kind"): row.get("sentence") for row in reversed(rows) if isinstance(row, Mapping) and "sentence" in row
+    }
     placed = {row.get("kind") for row in content.get("faults") or []}
     found = []
     for row in rows:

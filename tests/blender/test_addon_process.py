@@ -66,8 +66,15 @@ def test_faults_of_a_summary_are_rows_with_garment_frame_and_numbers(tmp_path: P
     path = tmp_path / "summary.json"
     assert fault.faults_in(path, NAMES) == []
     placed = [
-        {"kind": "cloth_through_cloth", "garment": "coat", "first_frame": 4, "frames": [[4, 6]], "triangles": [1, 5], "fix": None},
-        {"kind": "distance", "garment": "slip", "first_frame": 0, "frames": [[0, 1]], "vertices": [3], "fix": "solve further"},
+        {
+            "kind": "cloth_through_cloth",
+            "garment": "coat",
+            "first_frame": 4,
+            "frames": [[4, 6]],
+            "triangles": [1, 5],
+            "fix": None,
+        },
+        {"kind": "distance", "garment": "slip", "first_frame": 0, "vertices": [3], "fix": "solve further"},
     ]
     reasons = [{"kind": "cloth_through_cloth", "sentence": "pieces cross in 3 frames", "frames": [[4, 6]]}]
     doubts = [{"kind": "frame_rate", "sentence": "no rate"}, {"kind": "x", "sentence": "coat: edges", "edges": [[1, 2]]}]
