@@ -7,7 +7,10 @@ BIN := $(VENV)/bin
 # Of benchmarks the types are checked for names that are not there, not for values.
 LOOSE := arg-type assignment call-arg call-overload dict-item index misc operator return-value union-attr var-annotated
 
-.PHONY: demo test tests lint style types slow envelope docs notebooks clean
+.PHONY: demo test tests lint style types slow envelope docs notebooks addon test-blender clean
+# The version of Blender, as a module of Python 3.11 (400 MB), in which test-blender runs the add-on.
+BPY ?= 4.5.0
+PYTHON_BPY ?= python3.11
 
 demo: $(VENV)/.demo
 	$(BIN)/hood rollout garment=swing_4k material=silk_crepe num_frames=60 output=outputs/demo
@@ -35,6 +38,18 @@ docs: $(VENV)/.docs
 # The notebooks with what they print and draw; the tests run their code without Jupyter.
 notebooks: $(VENV)/.notebooks
 	$(BIN)/python -m tools.notebooks
+
+# The add-on as the zip that Blender installs from disk.
+addon:
+	$(PYTHON) blender/make_zip.py outputs/hood_blender.zip
+
+test-blender: $(VENV)/.dev $(VENV)/bpy-$(BPY)/.made
+	HOOD_BLENDER_PYTHON=$(CURDIR)/$(VENV)/bpy-$(BPY)/bin/python $(BIN)/python -m pytest -m "slow or not slow" tests/blender
+
+$(VENV)/bpy-$(BPY)/.made:
+	$(PYTHON_BPY) -m venv $(@D)
+	$(@D)/bin/python -m pip install -q $(PIP_ARGS) bpy==$(BPY) h5py pytest
+	@touch $@
 
 lint: style types
 

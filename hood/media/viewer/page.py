@@ -90,7 +90,8 @@ def shared_marks(
 ) -> list[dict[str, Any]]:
     """Those of several named rollouts as JSON; where not all have one, with the names of those that do."""
     by_mark: dict[Mark, list[str]] = {}
-    for (name, data), verdict in zip(rollouts, verdicts or [None] * len(rollouts), strict=True):
+    judged: Sequence[Verdict | None] = verdicts or [None] * len(rollouts)
+    for (name, data), verdict in zip(rollouts, judged, strict=True):
         for mark in dict.fromkeys(marks_of(data, verdict)):
             by_mark.setdefault(mark, []).append(name)
     return [
