@@ -1,4 +1,4 @@
-"""The table of recipes in docs/train.md: every key is there, with the value that it has in each experiment."""
+"""The table of recipes in hood/studies/notes/training.md: every key is there, with the value that it has in each experiment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from hood.app.settings.compose import load_config, plain
 
-PAGE = Path(__file__).parents[2] / "docs" / "train.md"
+PAGE = Path(__file__).parents[2] / "hood" / "studies" / "notes" / "training.md"
 TEXT = PAGE.read_text(encoding="utf-8").split("<!-- recipes: begin -->\n")[1].split("<!-- recipes: end -->")[0]
 HEAD, _, *LINES = [[cell.strip() for cell in line.strip("|").split("|")] for line in TEXT.strip().splitlines()]
 EXPERIMENTS = HEAD[1:-1]
@@ -57,7 +57,7 @@ def test_what_the_text_below_says(experiment: str) -> None:
 def test_the_page_about_own_files_has_every_key_of_data_with_a_value_that_it_takes() -> None:
     rows = [
         [re.findall(r"`([^`]+)`", cell) for cell in line.split("|")[1:3]]
-        for line in PAGE.with_name("own_data.md").read_text(encoding="utf-8").splitlines()
+        for line in (Path(__file__).parents[2] / "docs" / "own_data.md").read_text(encoding="utf-8").splitlines()
         if line.startswith("| `data.")
     ]
     words = [f"{key}={value}" for keys, values in rows for key, value in zip(keys, values, strict=True)]
