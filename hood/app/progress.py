@@ -38,8 +38,8 @@ from hood.steppers.refined import GuessStepper, RefinedStepper
 from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.simulator import CapturedSimulator
 
-#: Seconds from one write to the next, at least: what a kill costs at most beside the frame that it meets.
-_EVERY = 1.0
+#: From one write to the next it takes so many times as long as a write, at least: long frames are kept one by one.
+_APART = 20.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ def remembers(stepper: Stepper) -> bool:
 
 
 class ProgressFile:
-    """``rollout.state`` in the folder of a rollout that runs: written every second, and where the rollout ends too early.
+    """``rollout.state`` in the folder of a rollout that runs: written after every frame, or every few of short ones, and where
+    the rollout ends too early.
 
     It has one size, however long the rollout.
 
@@ -76,7 +77,7 @@ class ProgressFile:
 
     def __init__(self, folder: Path, scene: Scene, stepper: Stepper) -> None:
         self._path, self._made_of = folder / STATE, _made_of(scene)
-        self._keeps, self._written = not remembers(stepper), -np.inf
+        self._keeps, self._due = not remembers(stepper), -np.inf
         self._now: RolloutProgress | None = None
 
     def keep(self, now: RolloutProgress) -> None:
@@ -87,7 +88,7 @@ class ProgressFile:
         """
         if self._keeps:
             self._now = now
-            if time.monotonic() - self._written >= _EVERY:
+            if time.monotonic() >= self._due:
                 self.write()
 
     def write(self) -> bool:
@@ -98,8 +99,10 @@ class ProgressFile:
         """
         if self._now is None:
             return False
+        begun = time.monotonic()
         write_atomically(self._path, _packed(self._now, self._made_of))
-        self._written = time.monotonic()
+        ended = time.monotonic()
+        self._due = ended + _APART * (ended - begun)
         return True
 
     def write_last(self) -> bool:
