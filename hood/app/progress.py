@@ -38,12 +38,12 @@ from hood.steppers.refined import GuessStepper, RefinedStepper
 from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.simulator import CapturedSimulator
 
-#: Seconds from one write to the next, at least: what a kill costs at most beside the frame that it meets.
-_EVERY = 1.0
+#: From one write to the next it takes so many times as long as a write, at least: long frames are kept one by one.
+_APART = 20.0
 
 
 @dataclass(frozen=True)
-class Progress:
+class RolloutProgress:
     """A rollout after a simulated frame: all that the next frames depend on beside its settings and files."""
 
     frame: Frame  # with its state
@@ -56,15 +56,16 @@ class Progress:
 
 
 def remembers(stepper: Stepper) -> bool:
-    """Whether a stepper remembers more from step to step than :class:`Progress` keeps: those of a plan with parts left out do,
-    and nothing is known of those of other packages."""
+    """Whether a stepper remembers more from step to step than :class:`RolloutProgress` keeps: those of a plan with parts left
+    out do, and nothing is known of those of other packages."""
     if type(stepper) is RefinedStepper:
         return not stepper.is_plain or remembers(stepper.inner)
     return type(stepper) not in (NewtonStepper, NetworkStepper, GuessStepper, CapturedSimulator, CapturedNewton)
 
 
 class ProgressFile:
-    """``rollout.state`` in the folder of a rollout that runs: written every second, and where the rollout ends too early.
+    """``rollout.state`` in the folder of a rollout that runs: written after every frame, or every few of short ones, and where
+    the rollout ends too early.
 
     It has one size, however long the rollout.
 
@@ -76,10 +77,10 @@ class ProgressFile:
 
     def __init__(self, folder: Path, scene: Scene, stepper: Stepper) -> None:
         self._path, self._made_of = folder / STATE, _made_of(scene)
-        self._keeps, self._written = not remembers(stepper), -np.inf
-        self._now: Progress | None = None
+        self._keeps, self._due = not remembers(stepper), -np.inf
+        self._now: RolloutProgress | None = None
 
-    def keep(self, now: Progress) -> None:
+    def keep(self, now: RolloutProgress) -> None:
         """Remember where the rollout is; write it where the last time was a while ago.
 
         Raises:
@@ -87,7 +88,7 @@ class ProgressFile:
         """
         if self._keeps:
             self._now = now
-            if time.monotonic() - self._written >= _EVERY:
+            if time.monotonic() >= self._due:
                 self.write()
 
     def write(self) -> bool:
@@ -98,8 +99,10 @@ class ProgressFile:
         """
         if self._now is None:
             return False
+        begun = time.monotonic()
         write_atomically(self._path, _packed(self._now, self._made_of))
-        self._written = time.monotonic()
+        ended = time.monotonic()
+        self._due = ended + _APART * (ended - begun)
         return True
 
     def write_last(self) -> bool:
@@ -115,7 +118,7 @@ class ProgressFile:
         self._path.unlink(missing_ok=True)
 
 
-def find_progress(folder: Path, config: RolloutSettings, digest: str, scene: Scene, stepper: Stepper) -> Progress | None:
+def find_progress(folder: Path, config: RolloutSettings, digest: str, scene: Scene, stepper: Stepper) -> RolloutProgress | None:
     """Where the rollout in ``folder`` was stopped; None where there is none, or none that goes on as ``config`` asks: a
     sentence says why.
 
@@ -137,11 +140,11 @@ def find_progress(folder: Path, config: RolloutSettings, digest: str, scene: Sce
 
 
 def memories(guard: Guard | None, stepper: Stepper) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """What guard and goal know, for :class:`Progress`."""
+    """What guard and goal know, for :class:`RolloutProgress`."""
     return ({} if guard is None else guard.memory), (stepper.learned if isinstance(stepper, RefinedStepper) else {})
 
 
-def recall(found: Progress, folder: Path, guard: Guard | None) -> None:
+def recall(found: RolloutProgress, folder: Path, guard: Guard | None) -> None:
     """Let a new guard know what that of the stopped rollout knew."""
     if guard is not None:
         with h5py.File(folder / "rollout.h5", "r") as file:
@@ -149,7 +152,7 @@ def recall(found: Progress, folder: Path, guard: Guard | None) -> None:
 
 
 def _why_not(
-    found: Progress, attributes: Mapping[str, Any], config: RolloutSettings, digest: str, scene: Scene, stepper: Stepper
+    found: RolloutProgress, attributes: Mapping[str, Any], config: RolloutSettings, digest: str, scene: Scene, stepper: Stepper
 ) -> str:
     """Why a rollout does not go on from there; "" where it does."""
     other = other_settings(config, dict(attributes))
@@ -162,7 +165,7 @@ def _why_not(
     return "what takes its steps remembers more than a file keeps" if remembers(stepper) else ""
 
 
-def _read(folder: Path, attributes: Mapping[str, Any], scene: Scene) -> tuple[Progress | None, str]:
+def _read(folder: Path, attributes: Mapping[str, Any], scene: Scene) -> tuple[RolloutProgress | None, str]:
     """What the file says; None, and why it is of no use."""
     if "store" in attributes or not (folder / STATE).is_file():
         return None, "no rollout.state there says where it was stopped"
@@ -202,7 +205,7 @@ def _digest(values: Sequence[Any]) -> str:
     return found.hexdigest()
 
 
-def _packed(now: Progress, made_of: Mapping[str, str]) -> bytes:
+def _packed(now: RolloutProgress, made_of: Mapping[str, str]) -> bytes:
     state, arrays = now.frame.state, {}
     for name in ("pos", "vel", "origin"):
         arrays[name] = getattr(state, name).cpu().numpy()
@@ -227,7 +230,7 @@ def _packed(now: Progress, made_of: Mapping[str, str]) -> bytes:
     return content.getvalue()
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray], said: Mapping[str, Any], scene: Scene) -> Progress:
+def _unpacked(arrays: Mapping[str, np.ndarray], said: Mapping[str, Any], scene: Scene) -> RolloutProgress:
     like = scene.cloth.rest_pos
     pos, vel, origin = (torch.from_numpy(arrays[name]) for name in ("pos", "vel", "origin"))
     if pos.shape != like.shape or vel.shape != like.shape or pos.dtype != like.dtype or origin.shape != (1, 3):
@@ -243,4 +246,4 @@ def _unpacked(arrays: Mapping[str, np.ndarray], said: Mapping[str, Any], scene: 
     eases = [None if ease is None else Ease(**{**ease, "gap": tuple(ease["gap"])}) for ease in said["eases"]]
     done = Done(*(int(said["done"][name]) for name in Done._fields))
     frame = Frame(int(said["index"]), state, pos, pos, {}, far=bool(said["far"]))
-    return Progress(frame, done, known, said["guard"], said["goal"], eases, said["warnings"])
+    return RolloutProgress(frame, done, known, said["guard"], said["goal"], eases, said["warnings"])

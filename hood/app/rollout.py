@@ -40,7 +40,7 @@ from hood.app.output.export import (
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
-from hood.app.progress import Progress, ProgressFile, find_progress, memories, recall, remembers
+from hood.app.progress import ProgressFile, RolloutProgress, find_progress, memories, recall, remembers
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.fabrics import fabric_names
 from hood.app.scene.garments import describe_ease, summarise_ease
@@ -292,7 +292,7 @@ def _simulate_to_disk(
     bar: Bar,
     caches: StreamedCaches,
     kept: ProgressFile,
-    begun: Progress | None,
+    begun: RolloutProgress | None,
 ) -> bool:
     """Stream the rollout into ``path`` and ``caches``, and into ``kept`` where it is; True when the user interrupted it. What
     was ``begun`` goes on. ``asked`` is the config with ``auto`` in it, ``warned`` holds the doubts about its inputs. Where a
@@ -380,7 +380,7 @@ def _simulate_to_disk(
             yield frame
             write_alarms(writer, guard)
             recent = [] if steps is None else still_needed([*recent, frame], steps.rate, writer.frames_done)
-            kept.keep(Progress(frame, writer.done, recent, *memories(guard, stepper), tuple(eases), tuple(warned)))
+            kept.keep(RolloutProgress(frame, writer.done, recent, *memories(guard, stepper), tuple(eases), tuple(warned)))
 
     try:
         with writer:

@@ -25,7 +25,7 @@ NETWORK = ("stepper=network", "checkpoint=quickstart", "refine=5%", "guard=repai
 
 @pytest.fixture(autouse=True)
 def _every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "_EVERY", 0.0)
+    monkeypatch.setattr(progress, "_APART", 0.0)
 
 
 def _at(frame: int, act: Callable[[], None]) -> Any:

@@ -113,12 +113,10 @@ _SAMPLES = 28
 class PointCacheFiles:
     """The point caches of :func:`write_point_cache`, open for further frames of a rollout that is being made.
 
-    Frames are on the disk before the head of a file counts them: whoever opens it meanwhile, as Blender's modifier Mesh Cache
-    does, finds whole frames.
+    Frames are written before the head of a file counts them: whoever opens it meanwhile, as Blender does, finds whole ones.
 
     Args:
-        folder: where they were written.
-        data: what they were written from, by :func:`clip_of` without a thickness.
+        data: what they were written from into ``folder``, by :func:`clip_of` without a thickness.
     """
 
     def __init__(self, folder: Path, data: RolloutData) -> None:
@@ -141,8 +139,7 @@ class PointCacheFiles:
         """
         cloth, body = (np.asarray(pos, kind) for pos, kind in zip((cloth_pos, body_pos), self._kinds, strict=True))
         parts = [cloth[vertices] for vertices in self._vertices] + [body] * bool(len(body))
-        farther = not self._is_far and max(map(_farthest, parts)) > _FAR
-        if farther or not all(np.isfinite(pos).all() for pos in parts):
+        if not all(np.isfinite(pos).all() for pos in parts) or (max(map(_farthest, parts)) > _FAR and not self._is_far):
             return False
         for file, pos in zip(self._files, parts, strict=True):
             _put(file, np.ascontiguousarray(pos.astype(np.float64) - self._origin, "<f4").tobytes())

@@ -135,10 +135,7 @@ class RolloutWriter:
         self.frames_done = self.alarms_done = 0
         # Windows does not rename a file that is open.
         self._draft = path if sys.platform == "win32" else path.with_name(path.name + ".partial")
-        before = path
-        if done is not None and self._draft == path:
-            before = path.with_name(path.name + ".before")
-            os.replace(path, before)
+        before = path if done is None or self._draft != path else path.replace(path.with_name(path.name + ".before"))
         try:
             self._file = h5py.File(self._draft, "w")
         except OSError as error:
@@ -150,11 +147,8 @@ class RolloutWriter:
             for name, shape, kind in (("cloth/pos", cloth, cloth_real), ("body/pos", body, real)):
                 self._file.create_dataset(name, shape, dtype=kind, fillvalue=np.nan)
             _lay_out_values(self._file, cloth[:2], fields, metric_names)
-            self._file["cloth/faces"] = np.asarray(cloth_faces, dtype=np.int32)
-            self._file["cloth/rest_pos"] = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
-            self._file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
-            for name, values in (still or {}).items():
-                self._file.create_dataset(f"cloth/{name}", data=np.asarray(values, dtype=STILL[name]))
+            rest_pos = np.asarray(cloth_rest_pos, dtype=np.float64 if double else np.float32)
+            _lay_out_still(self._file, rest_pos, cloth_faces, body_faces, still or {})
             self._file["time"] = np.arange(num_frames) * dt
             own = {"dt": dt, "num_frames": 0, "num_planned": num_frames, "complete": False}
             self._steps = None if steps is None else StepTable(self._file, steps, metric_names)
@@ -166,12 +160,9 @@ class RolloutWriter:
             self._touch_all()
             by_frame = ("cloth/pos", "body/pos", *_field_paths(self._file), *_metric_paths(self._file))
             self._rows = {name: RowWriter(self._file[name]) for name in by_frame}
-            if done is not None:
-                self._take_over(before, done)
+            self._take_over(before, done)
             self._file.flush()
             self._take_name()
-            if before != path:
-                before.unlink()
         except OSError as error:
             self._discard(self._draft)
             raise _plain_error(error, path) from error
@@ -250,9 +241,11 @@ class RolloutWriter:
             pass  # a full disk refuses the final flush too; the file goes away anyway
         path.unlink(missing_ok=True)
 
-    def _take_over(self, before: Path, done: Done) -> None:
-        """Copy what is done from the file of before, and count it."""
+    def _take_over(self, before: Path, done: Done | None) -> None:
+        """Copy what is done from the file of before, if there is one, and count it."""
         target = self._file
+        if done is None:
+            return
         with h5py.File(before, "r") as source:
             for name in ("cloth/pos", "body/pos", *_field_paths(target), *_metric_paths(target)):
                 _copy_rows(source[name], target[name], done.frames)
@@ -266,6 +259,9 @@ class RolloutWriter:
             target.attrs.modify("num_alarms", done.alarms)
         if self._steps is not None:
             self._steps.begin_after(done.steps)
+        if before != self.path:
+            target.flush()
+            before.unlink()
 
     def _take_name(self) -> None:
         """Let others read: the layout is on the disk, the file has its name and HDF5's lock on it is given back."""
@@ -345,6 +341,16 @@ def _still_paths(file: h5py.File) -> list[str]:
 def _alarm_paths(file: h5py.File) -> list[str]:
     known = own_group(file, "guard") or ()
     return [f"guard/{name}" for name in (*ALARM_COLUMNS, *STEP_COLUMNS) if name in known]
+
+
+def _lay_out_still(
+    file: h5py.File, rest_pos: np.ndarray, cloth_faces: np.ndarray, body_faces: np.ndarray, still: Mapping[str, np.ndarray]
+) -> None:
+    """What is the same in all frames."""
+    file["cloth/faces"], file["cloth/rest_pos"] = np.asarray(cloth_faces, dtype=np.int32), rest_pos
+    file["body/faces"] = np.asarray(body_faces, dtype=np.int32)
+    for name, values in still.items():
+        file.create_dataset(f"cloth/{name}", data=np.asarray(values, dtype=STILL[name]))
 
 
 def _lay_out_values(file: h5py.File, shape: tuple[int, int], fields: Sequence[str], metric_names: Sequence[str]) -> None:
