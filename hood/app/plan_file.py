@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from hood import plugins
-from hood.app.settings.compose import ConfigError, load_config, named_today
+from hood.app.settings.compose import ConfigError, load_config, named_today, plain
 from hood.app.settings.rollout_settings import RolloutSettings, refinement
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.guarded import check_size
@@ -44,11 +44,20 @@ def content_digest(words: Sequence[str]) -> str:
     said = hashlib.sha256("\0".join(sorted(words)).encode())
     config = load_config("rollout", words)
     for key, value in [*((key, config[key]) for key in _FILES), ("refine", refinement(config).table)]:
-        for name in value if isinstance(value, Sequence) and not isinstance(value, str) else [value]:
+        for name in _names_in(plain(value)):
             said.update(f"\0{key}".encode())
-            for part in _content_of(key, str(name)):
+            for part in _content_of(key, name):
                 said.update(part)
     return said.hexdigest()
+
+
+def _names_in(value: Any) -> Iterator[str]:
+    """What may name files in a value, in lists and tables as well."""
+    if isinstance(value, (list, Mapping)):
+        for one in value.values() if isinstance(value, Mapping) else value:
+            yield from _names_in(one)
+    else:
+        yield str(value)
 
 
 def _content_of(key: str, name: str) -> Iterator[bytes]:

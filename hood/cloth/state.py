@@ -55,7 +55,7 @@ class StepInput:
     pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices and those of ``pin_stiffness``
     attachments: Attachments | None = None
     time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
-    pin_stiffness: Tensor | None = None  # (V,) N/m of springs to ``pin_target``, 0 where there is none; None: nowhere
+    pin_stiffness: Tensor | None = None  # (V,) N/m of springs to ``pin_target`` (SoftPins), 0: none; None: nowhere
 
     def __post_init__(self) -> None:
         on_host = self.dt.device.type == "cpu" and not is_whole()  # values elsewhere are not read back: the host would wait

@@ -16,7 +16,7 @@ import hood
 from hood.cloth.cloth import Cloth, build_cloth, with_values
 from hood.cloth.state import Obstacle, State, StepInput
 from hood.energies.friction import Friction
-from hood.energies.potential import Potential, default_potential
+from hood.energies.potential import Potential, default_potential, with_soft_pins
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction, _followed_pressing, _pairs, _pressing, nearest_weights
 from hood.energies.wind import Wind
@@ -275,3 +275,18 @@ def test_what_has_no_derivative_is_refused() -> None:
     half = replace(problem, gravity=torch.zeros(3, requires_grad=True))
     with pytest.raises(ValueError, match=r"a tensor is torch.float32; give cloth, state and parameters in torch.float64"):
         differentiable_step(NewtonStepper(default_potential()), half)
+
+
+def test_places_and_stiffness_of_soft_pins() -> None:
+    pos, faces = sheet(3, 0.05)
+    cloth = build_cloth(pos, faces, hood.Material(), dtype=REAL)
+    potential = with_soft_pins(default_potential())
+
+    def loss(given: Values) -> Tensor:
+        target = torch.as_tensor(pos) + given["shift"] * torch.tensor([0.3, 1.0, -0.5], dtype=REAL)
+        stiffness = given["stiffness"] * torch.as_tensor(np.arange(9) < 3).to(REAL)
+        step = StepInput(dt=torch.tensor([1 / 30], dtype=REAL), pin_target=target, pin_stiffness=stiffness)
+        gravity = torch.tensor([0.0, -9.81, 0.0], dtype=REAL)
+        return weigh(frames(potential, cloth, at_rest(pos), [step] * 3, gravity), pos)
+
+    check(loss, {"shift": 0.01, "stiffness": 12.0}, 1e-5)
