@@ -28,7 +28,6 @@ from hood.assets.files.library import locate
 from hood.cli.compare import short_names
 from hood.rollouts.file.dataset import RolloutDataset
 from hood.rollouts.file.reader import RolloutData, published_bytes, read_published, read_rollout, write_rollout
-from hood.rollouts.verdict.rule import judge_rollout
 from hood.steppers.checkpoint import CAUTION, load_simulator, read_header, save_simulator
 from hood.steppers.published import SUFFIXES, read_reference_checkpoint
 
@@ -122,7 +121,7 @@ def view(arguments: Sequence[str]) -> int:
     names = short_names(files)
     title = " and ".join(names) if config.title is None else str(config.title)
     named = list(zip(names, rollouts, strict=True))
-    page = view_page(named, title, lay_on(textures, rollouts), [judge_rollout(data) for data in whole]).encode()
+    page = view_page(named, title, lay_on(textures, rollouts), whole).encode()
     target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(target, page)
     frames = max(len(data.time) for data in rollouts)
