@@ -12,7 +12,7 @@ import html
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -62,29 +62,27 @@ class TimelineMark:
 def timeline_marks(data: RolloutData, verdict: Verdict | None = None) -> list[TimelineMark]:
     """Events, alarms of the guard, and what the ``verdict`` says of frames, by frame; frames that are not there are left out.
 
-    Alarms of one cause that lie close together are one mark, with the worst value. A doubt without frames is marked at 0.
+    Alarms of one cause that lie close together are one mark, with the worst value. What is said of no frame is marked at 0.
     """
     found = [TimelineMark(frame, frame, "event", words) for frame, words in moments_of(data)]
+    said: list[tuple[str, str, str, Sequence[tuple[int, int]]]] = []  # kind, words, title and runs of simulated frames
     for cause in dict.fromkeys(str(alarm["cause"]) for alarm in data.alarms):
         mine = {int(alarm["frame"]): alarm for alarm in data.alarms if str(alarm["cause"]) == cause}
-        for first, last in _joined(sorted(mine), len(data.time)):
-            worst = max((mine[frame] for frame in mine if first <= frame <= last), key=lambda alarm: float(alarm["value"]))
+        for run in _joined([(frame, frame) for frame in sorted(mine)], len(data.time)):
+            worst = max((mine[frame] for frame in mine if run[0] <= frame <= run[1]), key=lambda alarm: float(alarm["value"]))
             told = f"{cause}, {worst['value']:.3g}" if np.isfinite(worst["value"]) else cause
             limit = f" (limit {worst['limit']:.3g})" if np.isfinite(worst["limit"]) else ""
-            title = f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}"
-            found.append(TimelineMark(_stored(data, first), _stored(data, last), "alarm", cause, title))
-    for reason in () if verdict is None or verdict.sound is not False else verdict.reasons:
-        for first, last in reason.frames:
-            name = reason.kind.replace("_", " ")
-            found.append(
-                TimelineMark(_stored(data, first), _stored(data, last), "unsound", name, f"unsound: {reason.sentence}")
-            )
+            said.append(("alarm", cause, f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}", [run]))
+    if verdict is not None and verdict.sound is False:
+        said += [("unsound", one.kind, f"unsound: {one.sentence}", one.frames) for one in verdict.reasons]
     for doubt in () if verdict is None else verdict.doubts:
-        for first, last in _joined(sorted(doubt["frames"]), len(data.time)) or [(0, 0)]:
-            name, title = str(doubt["kind"]).replace("_", " "), f"doubt: {doubt['sentence']}"
-            found.append(TimelineMark(_stored(data, first), _stored(data, last), "doubt", name, title))
-    there = (replace(mark, last=min(mark.last, len(data.time) - 1)) for mark in found if 0 <= mark.frame < len(data.time))
-    return sorted(there, key=lambda mark: (mark.frame, mark.last))
+        runs = [(frame, frame) for frame in sorted(doubt["frames"])]
+        said.append(("doubt", str(doubt["kind"]), f"doubt: {doubt['sentence']}", runs))
+    for kind, words, title, given in said:
+        for first, last in _joined(given, len(data.time)) or [(0, 0)]:
+            ends = _stored(data, first), min(_stored(data, last), len(data.time) - 1)
+            found.append(TimelineMark(*ends, kind, words.replace("_", " "), title))
+    return sorted((mark for mark in found if 0 <= mark.frame < len(data.time)), key=lambda mark: (mark.frame, mark.last))
 
 
 def shared_marks(
@@ -110,15 +108,15 @@ def _stored(data: RolloutData, frame: int) -> int:
 _NEAR = 1 / 60
 
 
-def _joined(frames: Sequence[int], count: int) -> list[tuple[int, int]]:
-    """First and last of frames in rising order that lie close together."""
-    runs: list[tuple[int, int]] = []
-    for frame in frames:
-        if runs and frame - runs[-1][1] <= max(1, _NEAR * count):
-            runs[-1] = (runs[-1][0], frame)
+def _joined(runs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Those runs, first and last frames in rising order, that lie close together, as one."""
+    joined: list[tuple[int, int]] = []
+    for first, last in runs:
+        if joined and first - joined[-1][1] <= max(1, _NEAR * count):
+            joined[-1] = (joined[-1][0], last)
         else:
-            runs.append((frame, frame))
-    return runs
+            joined.append((first, last))
+    return joined
 
 
 def wind_of(data: RolloutData) -> str:

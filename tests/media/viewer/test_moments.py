@@ -80,7 +80,7 @@ def test_alarms_count_simulated_frames_where_others_are_stored() -> None:
 
 
 def test_reasons_and_doubts_of_the_verdict_are_marked() -> None:
-    """What is beyond the frames of the page is left out; a doubt about no frame stands at the first."""
+    """What is beyond the frames of the page is left out; what is said of no frame stands at the first."""
     reason = Reason("skin_depth", "skin stands out", ((3, 5), (8, 30), (40, 41)))
     doubts = [{"kind": "floor", "sentence": "it sinks", "frames": [4]}, {"kind": "density", "sentence": "heavy", "frames": []}]
     found = timeline_marks(rollout(), Verdict(False, (reason,), tuple(doubts)))
@@ -91,6 +91,9 @@ def test_reasons_and_doubts_of_the_verdict_are_marked() -> None:
         (8, 9, "unsound", "skin depth"),
     ]
     assert found[1].title == "unsound: skin stands out"
+    off = Verdict(False, (Reason("not_worn", "it has come off"), Reason("strain", "torn", ((1, 2), (3, 6)))))
+    marked = [(mark.frame, mark.last, mark.words) for mark in timeline_marks(rollout(), off)]
+    assert marked == [(0, 0, "not worn"), (1, 6, "strain")]
     assert timeline_marks(rollout(), Verdict(None, (Reason("gradient", "was not measured"),))) == []
 
 
