@@ -180,7 +180,7 @@ def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.
     return found
 
 
-def parts_of(data: RolloutData, pieces: Sequence[GarmentPiece]) -> tuple[list[str], np.ndarray]:
+def hideable_parts(data: RolloutData, pieces: Sequence[GarmentPiece]) -> tuple[list[str], np.ndarray]:
     """Names of the parts of the cloth, and the part (F,) of every face: garments, and within them their fabrics and what rides
     on them, as buttons and pockets."""
     count, (_, riding), faces = len(data.cloth_faces), data.riding, data.cloth_faces

@@ -88,10 +88,13 @@ def test_values_beyond_the_scale_keep_their_order_and_size() -> None:
 
 
 def test_distances_before_a_falling_scale_and_values_that_are_missing() -> None:
-    values = np.array([[0.5, 0.02, 0.01, 0.0, np.nan]])
+    """20 mm are the start of the scale; up to 50 mm are held, within a millimetre near the scale."""
+    values = np.array([[0.5, 0.021, 0.01, 0.0, np.nan]])
     colouring = Colouring(values, 0.02, 0.0, False, "distance from the body", ((0.02, "20 mm"), (0.0, "0 mm")))
     codes = _codes(colouring, levels := _levels([colouring]))
-    assert np.allclose(0.02 - 0.02 * levels[codes[0, :4]], values[0, :4], atol=5e-5)
+    held = 0.02 - 0.02 * levels[codes[0, :4]]
+    assert np.allclose(held, [0.05, 0.021, 0.01, 0.0], atol=1e-3)
+    assert np.allclose(held[2:], values[0, 2:4], atol=5e-5)
     assert codes[0, 4] == 255
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hood.media.pieces import parts_of, pieces_of
+from hood.media.pieces import hideable_parts, pieces_of
 from hood.rollouts.file.reader import RolloutData
 
 
@@ -21,7 +21,7 @@ def outfit() -> RolloutData:
 
 def test_parts_are_garments() -> None:
     data = outfit()
-    names, part = parts_of(data, pieces_of(data))
+    names, part = hideable_parts(data, pieces_of(data))
     assert names == ["tank", "skirt"]
     assert part.tolist() == [0, 0, 0, 1, 1, 1]
 
@@ -32,13 +32,13 @@ def test_fabrics_of_one_garment_and_what_rides_on_it_are_parts() -> None:
     fabric = np.repeat([0, 0, 0, 0, 1, 1], 3)
     told = data.attributes | {"riding_vertices": 3, "riding_faces": 1}
     data = replace(data, still=data.still | {"fabric": fabric}, attributes=told)
-    names, part = parts_of(data, pieces_of(data))
+    names, part = hideable_parts(data, pieces_of(data))
     assert names == ["tank", "skirt, silk", "skirt, denim", "skirt, denim, pockets and buttons"]
     assert part.tolist() == [0, 0, 0, 1, 2, 3]
 
 
 def test_an_older_file_is_one_part() -> None:
     data = replace(outfit(), still={}, attributes={})
-    names, part = parts_of(data, pieces_of(data))
+    names, part = hideable_parts(data, pieces_of(data))
     assert names == ["cloth"]
     assert not part.any()

@@ -14,7 +14,6 @@ from hood.app.output.export import lay_on, read_checked, read_textures
 from hood.app.settings.compose import ConfigError
 from hood.assets.files.atomic import write_atomically
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.rule import judge_rollout
 
 #: More would be too narrow to see anything.
 _MOST = 4
@@ -66,7 +65,7 @@ def viewer_page(arguments: Sequence[str]) -> Page:
     names = short_names(files)
     title = " and ".join(names) if config.title is None else str(config.title)
     named = list(zip(names, rollouts, strict=True))
-    text = view_page(named, title, lay_on(textures, rollouts), [judge_rollout(data) for data in whole])
+    text = view_page(named, title, lay_on(textures, rollouts), whole)
     most = max(max(data.cloth_pos.shape[1], data.body_pos.shape[1]) for data in rollouts)
     return Page(text, target, max(len(data.time) for data in rollouts), most)
 

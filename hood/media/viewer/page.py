@@ -12,7 +12,7 @@ import html
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ import numpy as np
 from hood.assets.formats.image import Texture
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
-from hood.media.pieces import looks_of, parts_of, pieces_of, split_seams
+from hood.media.pieces import hideable_parts, looks_of, pieces_of, split_seams
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.rule import Verdict
+from hood.rollouts.verdict.rule import Verdict, judge_rollout
 from hood.scene.holding import first_step
 
 _ACTIONS = ("open", "close", "detach", "attach")
@@ -49,7 +49,7 @@ def moments_of(data: RolloutData) -> list[tuple[int, str]]:
 
 
 @dataclass(frozen=True)
-class Mark:
+class TimelineMark:
     """Frames that the time line marks, in words."""
 
     frame: int
@@ -59,40 +59,39 @@ class Mark:
     title: str = ""  # the whole sentence, where the words are only its beginning
 
 
-def marks_of(data: RolloutData, verdict: Verdict | None = None) -> list[Mark]:
+def timeline_marks(data: RolloutData, verdict: Verdict | None = None) -> list[TimelineMark]:
     """Events, alarms of the guard, and what the ``verdict`` says of frames, by frame; frames that are not there are left out.
 
-    Alarms of one cause that lie close together are one mark, with the worst value. A doubt without frames is marked at 0.
+    Alarms of one cause that lie close together are one mark, with the worst value. What is said of no frame is marked at 0.
     """
-    found = [Mark(frame, frame, "event", words) for frame, words in moments_of(data)]
+    found = [TimelineMark(frame, frame, "event", words) for frame, words in moments_of(data)]
+    said: list[tuple[str, str, str, Sequence[tuple[int, int]]]] = []  # kind, words, title and runs of simulated frames
     for cause in dict.fromkeys(str(alarm["cause"]) for alarm in data.alarms):
         mine = {int(alarm["frame"]): alarm for alarm in data.alarms if str(alarm["cause"]) == cause}
-        for first, last in _joined(sorted(mine), len(data.time)):
-            worst = max((mine[frame] for frame in mine if first <= frame <= last), key=lambda alarm: float(alarm["value"]))
+        for run in _joined([(frame, frame) for frame in sorted(mine)], len(data.time)):
+            worst = max((mine[frame] for frame in mine if run[0] <= frame <= run[1]), key=lambda alarm: float(alarm["value"]))
             told = f"{cause}, {worst['value']:.3g}" if np.isfinite(worst["value"]) else cause
             limit = f" (limit {worst['limit']:.3g})" if np.isfinite(worst["limit"]) else ""
-            title = f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}"
-            found.append(Mark(_stored(data, first), _stored(data, last), "alarm", cause, title))
-    for reason in () if verdict is None or verdict.sound is not False else verdict.reasons:
-        for first, last in reason.frames:
-            name = reason.kind.replace("_", " ")
-            found.append(Mark(_stored(data, first), _stored(data, last), "unsound", name, f"unsound: {reason.sentence}"))
+            said.append(("alarm", cause, f"guard: {told} in frame {_stored(data, int(worst['frame']))}{limit}", [run]))
+    if verdict is not None and verdict.sound is False:
+        said += [("unsound", one.kind, f"unsound: {one.sentence}", one.frames) for one in verdict.reasons]
     for doubt in () if verdict is None else verdict.doubts:
-        for first, last in _joined(sorted(doubt["frames"]), len(data.time)) or [(0, 0)]:
-            name, title = str(doubt["kind"]).replace("_", " "), f"doubt: {doubt['sentence']}"
-            found.append(Mark(_stored(data, first), _stored(data, last), "doubt", name, title))
-    there = (replace(mark, last=min(mark.last, len(data.time) - 1)) for mark in found if 0 <= mark.frame < len(data.time))
-    return sorted(there, key=lambda mark: (mark.frame, mark.last))
+        runs = [(frame, frame) for frame in sorted(doubt["frames"])]
+        said.append(("doubt", str(doubt["kind"]), f"doubt: {doubt['sentence']}", runs))
+    for kind, words, title, given in said:
+        for first, last in _joined(given, len(data.time)) or [(0, 0)]:
+            ends = _stored(data, first), min(_stored(data, last), len(data.time) - 1)
+            found.append(TimelineMark(*ends, kind, words.replace("_", " "), title))
+    return sorted((mark for mark in found if 0 <= mark.frame < len(data.time)), key=lambda mark: (mark.frame, mark.last))
 
 
 def shared_marks(
     rollouts: Sequence[tuple[str, RolloutData]], verdicts: Sequence[Verdict] | None = None
 ) -> list[dict[str, Any]]:
     """Those of several named rollouts as JSON; where not all have one, with the names of those that do."""
-    by_mark: dict[Mark, list[str]] = {}
-    judged: Sequence[Verdict | None] = verdicts or [None] * len(rollouts)
-    for (name, data), verdict in zip(rollouts, judged, strict=True):
-        for mark in dict.fromkeys(marks_of(data, verdict)):
+    by_mark: dict[TimelineMark, list[str]] = {}
+    for at, (name, data) in enumerate(rollouts):
+        for mark in dict.fromkeys(timeline_marks(data, None if verdicts is None else verdicts[at])):
             by_mark.setdefault(mark, []).append(name)
     return [
         asdict(mark) | ({} if len(names) == len(rollouts) else {"words": f"{mark.words} ({', '.join(names)})"})
@@ -109,15 +108,15 @@ def _stored(data: RolloutData, frame: int) -> int:
 _NEAR = 1 / 60
 
 
-def _joined(frames: Sequence[int], count: int) -> list[tuple[int, int]]:
-    """First and last of frames in rising order that lie close together."""
-    runs: list[tuple[int, int]] = []
-    for frame in frames:
-        if runs and frame - runs[-1][1] <= max(1, _NEAR * count):
-            runs[-1] = (runs[-1][0], frame)
+def _joined(runs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Those runs, first and last frames in rising order, that lie close together, as one."""
+    joined: list[tuple[int, int]] = []
+    for first, last in runs:
+        if joined and first - joined[-1][1] <= max(1, _NEAR * count):
+            joined[-1] = (joined[-1][0], last)
         else:
-            runs.append((frame, frame))
-    return runs
+            joined.append((first, last))
+    return joined
 
 
 def wind_of(data: RolloutData) -> str:
@@ -207,7 +206,7 @@ def unpack_bytes(text: str) -> bytes:
 #: The ramp's last colour, of vertices without a value; the codes of values are below.
 _UNKNOWN = 255
 #: Codes of values below and above the scale, where there are such.
-_BELOW, _ABOVE = 20, 30
+_BELOW, _ABOVE = 8, 30
 #: What the menu calls a colouring, factor and unit of its numbers there, and its scale that is the same in every page.
 _SHOWN: dict[str, tuple[str, float, str, tuple[float, float]]] = {
     "strain": ("strain", 100.0, "%", (0.0, 0.1)),
@@ -228,13 +227,13 @@ def view_page(
     rollouts: Sequence[tuple[str, RolloutData]],
     title: str,
     textures: Sequence[Mapping[str, Texture]] | None = None,
-    verdicts: Sequence[Verdict] | None = None,
+    whole: Sequence[RolloutData] | None = None,
 ) -> str:
     """The HTML of named rollouts, which loads nothing from anywhere.
 
     Args:
         textures: of every rollout the images of its garments, by the names of :func:`hood.media.pieces.pieces_of`.
-        verdicts: of every rollout, whose reasons and doubts the time line marks; None marks events and alarms only.
+        whole: the rollouts with all their frames, whose verdicts the time line marks; None marks events and alarms only.
 
     Raises:
         ValueError: there is none, or their frames are not equally far apart in time.
@@ -256,7 +255,7 @@ def view_page(
     content = {
         "images": [image.address for image in images],
         "seconds": seconds[0],
-        "moments": shared_marks(rollouts, verdicts),
+        "moments": shared_marks(rollouts, None if whole is None else [judge_rollout(data) for data in whole]),
         "floor": min(_lowest(data) for data in every),
         "ramp": np.rint(255.0 * colours_at(np.append(np.linspace(0.0, 1.0, _UNKNOWN), np.nan))).astype(int).tolist(),
         "scales": [_scale(name, by[0], levels[name]) for name, by in painted.items()],
@@ -291,9 +290,10 @@ def _lowest(data: RolloutData) -> float:
 def _levels(colourings: Sequence[Colouring]) -> np.ndarray:
     """Places (255,) on a scale, rising, one a code: evenly from 0 to 1 between its ends, and ever wider apart beyond them.
 
-    They go as far as there are values: at most 1,000 lengths of the scale, of a logarithmic one a length below and three above.
+    They go as far as there are values, but at most 1.5 lengths of the scale below and 1,000 above it, 1 and 3 on a logarithmic
+    scale; farther values have the last code.
     """
-    farthest = (-1.0, 4.0) if colourings[0].logarithmic else (-1e3, 1e3)
+    farthest = (-1.0, 4.0) if colourings[0].logarithmic else (-1.5, 1e3)
     place = np.concatenate([_place(one).ravel() for one in colourings])
     place = np.clip(place[~np.isnan(place)], *farthest)
     low, high = float(place.min(initial=0.0)), float(place.max(initial=1.0))
@@ -374,7 +374,7 @@ def _parted(data: RolloutData, textures: Mapping[str, Texture], images: Sequence
     steps of :data:`UV_STEP`; ``groups`` say of how many faces in their order which image is drawn on them, null for none.
     """
     pieces = pieces_of(data)
-    names, part = parts_of(data, pieces)
+    names, part = hideable_parts(data, pieces)
     parts = {"names": names, "of": pack_integers(part)}
     if not textures:
         return {"parts": parts, "mapped": None}

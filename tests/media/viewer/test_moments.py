@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hood.media.viewer.page import Mark, marks_of, moments_of, shared_marks, wind_of
+from hood.media.viewer.page import TimelineMark, moments_of, shared_marks, timeline_marks, wind_of
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.step_table import OutputRate, Steps
 from hood.rollouts.verdict.rule import Reason, Verdict
@@ -50,7 +50,7 @@ def test_events_count_simulated_frames_where_others_are_stored() -> None:
     assert moments_of(replace(usual, steps=steps)) == [(2, "open zip"), (3, "close zip"), (5, "close hood")]
 
 
-def test_marks_of_several_rollouts_name_those_that_have_them() -> None:
+def test_timeline_marks_several_rollouts_name_those_that_have_them() -> None:
     opens, closes = {"frame": 2, "open": "zip"}, {"frame": 5, "close": "zip"}
     one, other = rollout(events=[opens, closes]), rollout(frames=4, events=[closes, opens])
     both = [(mark["frame"], mark["words"]) for mark in shared_marks([("a", one), ("b", other)])]
@@ -64,10 +64,10 @@ def alarm(frame: int, cause: str, value: float) -> dict[str, Any]:
 
 def test_alarms_of_one_cause_that_follow_each_other_are_one_mark() -> None:
     rows = [alarm(2, "strain", 0.3), alarm(3, "strain", 0.5), alarm(3, "cut", 0.1), alarm(7, "strain", 0.4)]
-    assert marks_of(replace(rollout(), alarms=rows)) == [
-        Mark(2, 3, "alarm", "strain", "guard: strain, 0.5 in frame 3 (limit 0.25)"),
-        Mark(3, 3, "alarm", "cut", "guard: cut, 0.1 in frame 3 (limit 0.25)"),
-        Mark(7, 7, "alarm", "strain", "guard: strain, 0.4 in frame 7 (limit 0.25)"),
+    assert timeline_marks(replace(rollout(), alarms=rows)) == [
+        TimelineMark(2, 3, "alarm", "strain", "guard: strain, 0.5 in frame 3 (limit 0.25)"),
+        TimelineMark(3, 3, "alarm", "cut", "guard: cut, 0.1 in frame 3 (limit 0.25)"),
+        TimelineMark(7, 7, "alarm", "strain", "guard: strain, 0.4 in frame 7 (limit 0.25)"),
     ]
 
 
@@ -75,15 +75,15 @@ def test_alarms_count_simulated_frames_where_others_are_stored() -> None:
     none = np.zeros(0, dtype=np.int64)
     steps = Steps(OutputRate(10.0, 40.0), np.ones(37, dtype=bool), {}, none, np.zeros((37, 0, 3)))
     rows = [alarm(5, "strain", 0.3), alarm(6, "strain", 0.3), alarm(36, "cut", 0.1)]
-    found = marks_of(replace(rollout(), alarms=rows, steps=steps))
+    found = timeline_marks(replace(rollout(), alarms=rows, steps=steps))
     assert [(mark.frame, mark.last) for mark in found] == [(2, 2), (9, 9)]
 
 
 def test_reasons_and_doubts_of_the_verdict_are_marked() -> None:
-    """What is beyond the frames of the page is left out; a doubt about no frame stands at the first."""
+    """What is beyond the frames of the page is left out; what is said of no frame stands at the first."""
     reason = Reason("skin_depth", "skin stands out", ((3, 5), (8, 30), (40, 41)))
     doubts = [{"kind": "floor", "sentence": "it sinks", "frames": [4]}, {"kind": "density", "sentence": "heavy", "frames": []}]
-    found = marks_of(rollout(), Verdict(False, (reason,), tuple(doubts)))
+    found = timeline_marks(rollout(), Verdict(False, (reason,), tuple(doubts)))
     assert [(mark.frame, mark.last, mark.kind, mark.words) for mark in found] == [
         (0, 0, "doubt", "density"),
         (3, 5, "unsound", "skin depth"),
@@ -91,7 +91,10 @@ def test_reasons_and_doubts_of_the_verdict_are_marked() -> None:
         (8, 9, "unsound", "skin depth"),
     ]
     assert found[1].title == "unsound: skin stands out"
-    assert marks_of(rollout(), Verdict(None, (Reason("gradient", "was not measured"),))) == []
+    off = Verdict(False, (Reason("not_worn", "it has come off"), Reason("strain", "torn", ((1, 2), (3, 6)))))
+    marked = [(mark.frame, mark.last, mark.words) for mark in timeline_marks(rollout(), off)]
+    assert marked == [(0, 0, "not worn"), (1, 6, "strain")]
+    assert timeline_marks(rollout(), Verdict(None, (Reason("gradient", "was not measured"),))) == []
 
 
 @pytest.mark.parametrize("attributes", [{}, {"config": "no table"}, {"config": "[]"}, {"dt": 0.1, "config": "{}"}])

@@ -49,8 +49,9 @@ def tube(shift: float = 0.0, flip: bool = False) -> RolloutData:
     return RolloutData(cloth, faces, pos, body, ball_faces, time / 30, figures, attributes, {}, alarms, still)
 
 
-def write(path: Path, *rollouts: RolloutData, **more: Any) -> Path:
-    path.write_text(view_page([(f"run {at}", data) for at, data in enumerate(rollouts)], "tubes", **more), encoding="utf-8")
+def write(path: Path, *rollouts: RolloutData, whole: bool = False) -> Path:
+    named = [(f"run {at}", data) for at, data in enumerate(rollouts)]
+    path.write_text(view_page(named, "tubes", whole=rollouts if whole else None), encoding="utf-8")
     return path
 
 
@@ -59,9 +60,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """The page of two rollouts that are 9 mm apart, open."""
     doubt = {"kind": "floor", "sentence": "it sinks", "frames": [9]}
     verdicts = [Verdict(False, (Reason("skin_depth", "skin stands out", ((7, 8),)),), (doubt,)), Verdict(True)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hood.media.viewer.page.judge_rollout", lambda _: verdicts.pop(0))
+        path = write(tmp_path_factory.mktemp("page") / "page.html", tube(), tube(0.009), whole=True)
     with Browser() as browser:
         browser.before(CLOCK)
-        browser.open(write(tmp_path_factory.mktemp("page") / "page.html", tube(), tube(0.009), verdicts=verdicts))
+        browser.open(path)
         yield browser
         assert browser.complaints == []
 
