@@ -33,9 +33,12 @@ class Collector:
             last = min(there, self.samples + most)
             if not self._caches:
                 self._begin(paths, headers)
-            for place, path in enumerate(paths):
-                assert path is not None
-                self._bring(place, point_cache.read_samples(path, self.samples, last))
+            try:
+                read = [point_cache.read_samples(path, self.samples, last) for path in paths if path is not None]
+            except FileNotFoundError:  # hood is about to put other files in their place
+                return self.samples
+            for place, samples in enumerate(read):
+                self._bring(place, samples)
             self.samples = last
             self._refresh()
         return self.samples

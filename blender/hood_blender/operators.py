@@ -122,7 +122,7 @@ def _with_time(steps: Iterator[float], progress: Progress, scene: str) -> Iterat
     there = bpy.data.scenes.get(scene)
     if there is not None and progress.seconds_per_frame > 0:
         there.hood.seconds_per_frame = progress.seconds_per_frame
-    if not bpy.app.background:
+    if bpy.ops.ed.undo_push.poll():  # so that undoing the user's next step does not take the modifier off
         bpy.ops.ed.undo_push(message="hood bake")
 
 

@@ -17,7 +17,7 @@ from blender.hood_blender.fault import BakeError
 from hood.assets.formats.vertex_files import read_point_cache
 from hood.assets.garment.garment import load_garment
 from hood.assets.motion.animated_mesh import load_mesh_sequence
-from hood.testing import cylinder
+from hood.testing import cylinder, sphere
 
 NONE = np.zeros(3)
 
@@ -66,7 +66,7 @@ def test_a_run_that_goes_on_keeps_its_samples_until_they_come_again(tmp_path: Pa
 
 @pytest.mark.parametrize("halves, rate", [([], 24.0), ([1], 48.0)])
 def test_a_captured_body_is_one_that_hood_reads(tmp_path: Path, halves: list[int], rate: float) -> None:
-    pos, faces = cylinder(8, 3, 0.2, 0.4)
+    pos, faces = sphere(1, 0.2)
     file = BodyFile(tmp_path / "capture" / "body.npz", faces)
     for frame in range(3):
         file.add(pos + [0.1 * frame * (frame == 2), 0.0, 0.0], 0.05)
