@@ -195,9 +195,10 @@ class Workshop:
         skin = {"JOINTS_0": writer.table(first.astype(np.uint8)), "WEIGHTS_0": writer.table(shares.astype(np.float32))}
         inverse = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
         inverse[:, 3, :3] = -joints  # column by column
-        nodes: list[dict[str, Any]] = [{"name": JOINTS[0], "translation": joints[0].tolist()}]
+        names = (*JOINTS, "left_hand", "right_hand")
+        nodes: list[dict[str, Any]] = [{"name": names[0], "translation": joints[0].tolist()}]
         for joint, parent in enumerate(body.parents[1:], start=1):
-            nodes.append({"name": JOINTS[joint], "translation": (joints[joint] - joints[parent]).tolist()})
+            nodes.append({"name": names[joint], "translation": (joints[joint] - joints[parent]).tolist()})
             nodes[parent].setdefault("children", []).append(joint)
         turns = Rotation.from_rotvec(self._walk.poses.reshape(-1, 3)).as_quat().reshape(COUNT, -1, 4)
         moves = {(joint, "rotation"): turns[:, joint] for joint in range(len(joints))}

@@ -13,7 +13,7 @@ from hood.energies.bending import Bending, CurrentLengthBending
 from hood.energies.compiled_elements import energies_and_gradient
 from hood.energies.contact import CentroidCollision, Collision
 from hood.energies.friction import CodedFriction, Friction, WeightFriction
-from hood.energies.mass_points import Attachment, Gravity, Inertia
+from hood.energies.mass_points import Attachment, Gravity, Inertia, SoftPins
 from hood.energies.membrane import Stretching
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
 from hood.energies.term import NOT_INTERNAL, Energy, checked, kind_of, prepared
@@ -135,6 +135,11 @@ class _Settled(Potential):
 
     def active(self, problem: StepProblem) -> dict[str, Term]:
         return self.terms
+
+
+def with_soft_pins(potential: Potential) -> Potential:
+    """The potential with springs to the places of soft pins, where steps have any."""
+    return potential.with_terms(soft_pins=SoftPins())
 
 
 def keeps_both_sides(potential: Potential) -> bool:

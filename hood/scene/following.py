@@ -17,7 +17,7 @@ from hood.scene.body_motion.mesh_motion import MeshMotion
 from hood.scene.body_motion.motion import BodyMotion, Motion
 
 #: A vertex farther than this [m] from what it is to follow is not worn there.
-REACH = 0.3
+SKIN_REACH = 0.3
 #: Spring constant [N/m] of a vertex of weight ½; of a weight w it is this times w / (1 - w).
 STIFFNESS = 10.0
 #: The whole surface, as what pins follow.
@@ -136,10 +136,10 @@ def _ride(group: PinGroup, rows: np.ndarray, pos: np.ndarray, surface: np.ndarra
         raise ValueError(f"{group.where}: follows={group.whom}, but there is no body; leave follows out")
     ride, dist = ride_on(pos[rows], rows, surface, motion.faces[_followed_faces(group, motion)])
     far = int(dist.argmax())
-    if dist[far] > REACH:
+    if dist[far] > SKIN_REACH:
         raise ValueError(
             f"{group.where}: vertex {rows[far]} is {dist[far]:.2f} m from the nearest skin of what it is to follow "
-            f"({group.whom}), beyond {REACH:g} m; let it follow another part, or leave follows out"
+            f"({group.whom}), beyond {SKIN_REACH:g} m; let it follow another part, or leave follows out"
         )
     return ride
 

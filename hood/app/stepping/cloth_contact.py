@@ -15,8 +15,7 @@ from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, f
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import MAY, losses_of, option_of
 from hood.assets.files.library import unknown
-from hood.energies.mass_points import SoftPins
-from hood.energies.potential import Potential
+from hood.energies.potential import Potential, with_soft_pins
 from hood.energies.self_contact import LayerBarrier, LayerFriction
 from hood.energies.term import Role, Term, having
 from hood.mesh import cloth_proximity
@@ -46,7 +45,7 @@ def potential_of(config: RolloutSettings) -> Potential:
     ``cloth_contact`` and the rest of the settled config ask for them."""
     potential: Potential = losses_of(config)
     if plain(config.pins) is not None:
-        potential = potential.with_terms(soft_pins=SoftPins())
+        potential = with_soft_pins(potential)
     asked = cloth_contact(config)
     if asked.mode == "off" or _why_not(config, potential):
         return potential
