@@ -12,10 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from hood.limits import CUT_UNSOUND
+from hood.limits import CUT_UNSOUND, STRAIN_UNSOUND
+from hood.media.pieces import pieces_by
+from hood.mesh.penetration.crossing import crossings, self_crossings
+from hood.mesh.topology import connected_components, unique_edges
 from hood.rollouts.file.reader import RolloutData
-from hood.rollouts.verdict.frames import worst_frame
-from hood.rollouts.verdict.rule import judge_rollout
+from hood.rollouts.verdict.causes import CROSSING_KINDS
+from hood.rollouts.verdict.frames import mask_of, runs_of, worst_frame
+from hood.rollouts.verdict.rule import Verdict, judge_rollout, stored_doubts
+from hood.rollouts.verdict.surface import Meshes, in_folds, meshes_of
 
 #: A rollout that ran to its end and cannot be trusted.
 UNSOUND = 3
@@ -107,7 +112,7 @@ FAIL_ON = FAIL_ON_UNSOUND, FAIL_ON_DOUBTS, FAIL_ON_NOTHING = "unsound", "doubts"
 
 def summarise_verdict(data: RolloutData) -> dict[str, Any]:
     """Entries ``sound`` (None: not known), ``reasons`` and ``unsound_reasons`` (their sentences; what is missing, where not
-    known), ``doubts``, ``notes`` and ``worst_frames``: docs/verdict.md has them as a schema."""
+    known), ``doubts``, ``faults``, ``notes`` and ``worst_frames``: docs/verdict.md has them as a schema."""
     verdict = judge_rollout(data)
     worst = {name: worst_frame(data.step_metrics[name]) for name in _WORST if name in data.step_metrics}
     return {
@@ -115,9 +120,80 @@ def summarise_verdict(data: RolloutData) -> dict[str, Any]:
         "reasons": [reason.as_dict() for reason in verdict.reasons],
         "unsound_reasons": list(verdict.sentences),
         "doubts": list(verdict.doubts),
+        "faults": find_faults(data, verdict),
         "notes": list(verdict.notes),
         "worst_frames": {name: {"value": found[0], "frame": found[1]} for name, found in worst.items() if found is not None},
     }
+
+
+#: Numbers of vertices or triangles that a fault names, at most.
+_NAMED = 200
+
+
+def find_faults(data: RolloutData, verdict: Verdict) -> list[dict[str, Any]]:
+    """Entry ``faults``: where the cloth is what makes the ``verdict`` unsound or doubtful, of every kind and garment.
+
+    ``first_frame`` and ``frames`` (runs, first and last) are as in the reasons. ``vertices`` or ``triangles`` are those of the
+    first of these frames that is stored, in numbers of the garment by itself, as its file and every export have them;
+    :data:`_NAMED` at most, and none of what is not known of single ones.
+    """
+    told = [(one.kind, one.frames, one.sentence, one.part) for one in verdict.reasons] if verdict.sound is False else []
+    for doubt in verdict.doubts[len(stored_doubts(data)) :]:
+        runs = tuple(runs_of(mask_of(doubt["frames"]))) if doubt["frames"] else ()
+        crossed = (kind for kind, what in CROSSING_KINDS.values() if f"triangles of {what} pass" in doubt["sentence"])
+        told.append((next(crossed, doubt["kind"]), runs, doubt["sentence"], None))
+    meshes = meshes_of(data)
+    title, count = str(data.attributes.get("garment", "cloth")), meshes.cloth.shape[1]
+    pieces = pieces_by(title, count, meshes.faces, {} if meshes.piece is None else {"piece": meshes.piece})
+    found: list[dict[str, Any]] = []
+    for kind, runs, sentence, part in told:
+        if not runs:
+            continue
+        fault = {"kind": kind, "garment": title, "first_frame": runs[0][0], "frames": [list(run) for run in runs]}
+        fix = sentence.partition("; ")[2] or None
+        stored = next((place for place, step in enumerate(meshes.step) if any(a <= step <= b for a, b in runs)), None)
+        what, numbers = ("vertices", np.zeros(0, np.int64)) if stored is None else _place(kind, data, meshes, stored, part)
+        if what == "triangles" and data.refined is not None:  # what is stored has other triangles
+            what, numbers = "vertices", np.unique(meshes.faces[numbers])
+        parts = [(piece.name, piece.vertices if what == "vertices" else piece.faces) for piece in pieces]
+        rows = [(name, np.searchsorted(own, numbers[np.isin(numbers, own)])[:_NAMED].tolist()) for name, own in parts]
+        named = [{**fault, "garment": name, what: own, "fix": fix} for name, own in rows if own]
+        found += named or [{**fault, "fix": fix}]
+    return found
+
+
+def _place(kind: str, data: RolloutData, meshes: Meshes, frame: int, part: int | None) -> tuple[str, np.ndarray]:
+    """``vertices`` or ``triangles``, and those that a fault of this kind is at in a stored frame; none where nobody knows."""
+    pos, body = meshes.cloth[frame].astype(np.float64), meshes.body[frame].astype(np.float64)
+    finite, faces = np.isfinite(pos).all(axis=1), meshes.faces
+    if kind == "not_finite":
+        return "vertices", np.flatnonzero(~finite)
+    if kind == "not_worn":
+        label = connected_components(len(pos), unique_edges(faces))
+        used = np.unique(faces)
+        return "vertices", used if part is None else used[label[used] == np.unique(label[used])[part - 1]]
+    if kind in ("distance", "solver_target", "gradient"):
+        force = np.nan_to_num(data.fields["rg"][frame, : len(pos)]) if "rg" in data.fields else np.zeros(len(pos))
+        order = np.argsort(-force, kind="stable")[:_NAMED]
+        return "vertices", order[force[order] > 0]
+    if not (finite.all() and np.isfinite(body).all()):
+        return "vertices", np.zeros(0, np.int64)
+    if kind == "strain":
+        edges = unique_edges(faces)
+        length = np.linalg.norm(pos[edges[:, 1]] - pos[edges[:, 0]], axis=1)
+        off = np.abs(length / meshes.rest_length - 1.0)
+        order = np.argsort(-off, kind="stable")
+        ends = edges[order[off[order] > STRAIN_UNSOUND.value]].reshape(-1)
+        return "vertices", ends[np.sort(np.unique(ends, return_index=True)[1])]
+    if kind in ("cloth_through_cloth", "garments_through_each_other"):
+        pairs = self_crossings(pos, faces)
+        piece = np.zeros(len(pos), np.int64) if meshes.piece is None else meshes.piece
+        same = piece[faces[pairs[:, 0], 0]] == piece[faces[pairs[:, 1], 0]]
+        return "triangles", np.unique(pairs[same == (kind == "cloth_through_cloth")])
+    if kind in ("skin_through_cloth", "skin_depth", "inside_body"):
+        pairs = crossings(pos, faces, body, meshes.body_faces).pairs
+        return "triangles", np.unique(pairs[~in_folds(pairs[:, 1], body, meshes.body_faces), 0])
+    return "vertices", np.zeros(0, np.int64)
 
 
 def describe_worst(summary: Mapping[str, Any], metric: str, form: str) -> str:

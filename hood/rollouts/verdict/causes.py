@@ -202,8 +202,8 @@ def strain_of(data: RolloutData, meshes: Meshes, finite: np.ndarray) -> np.ndarr
 
 
 _PAIRS = "pairs of triangles"
-#: Metric → kind, and what passes through what.
-_CROSSINGS = {
+#: Metric → kind, and what passes through what in the sentences.
+CROSSING_KINDS = {
     "self_crossings": ("cloth_through_cloth", "cloth"),
     "garment_crossings": ("garments_through_each_other", "two garments"),
 }
@@ -213,10 +213,10 @@ def crossing_causes(meshes: Meshes, metrics: Mapping[str, np.ndarray]) -> FoundF
     """Cloth through cloth that a viewer sees."""
     found, edge = FoundFrames(), meshes.edge_length
     most, most_seen = pairs_along(CROSSINGS_UNSOUND.value, edge), pairs_along(CROSSINGS_SEEN.value, edge)
-    every_pair = sum((np.nan_to_num(metrics[name]) for name in _CROSSINGS), np.zeros(len(metrics["self_crossings"])))
+    every_pair = sum((np.nan_to_num(metrics[name]) for name in CROSSING_KINDS), np.zeros(len(metrics["self_crossings"])))
     looked = visible_crossings(meshes, every_pair, most)
     hidden = bool(looked) and all(shown <= most_seen for shown, _ in looked.values())
-    for name, (kind, what) in _CROSSINGS.items():
+    for name, (kind, what) in CROSSING_KINDS.items():
         counts = metrics[name]
         text = f"more than {most} pairs of triangles of {what} pass through each other"
         first = counts[0] if len(counts) and np.isfinite(counts[0]) else 0.0
