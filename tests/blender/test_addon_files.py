@@ -191,7 +191,7 @@ def test_it_imports_what_blender_has_and_nothing_else() -> None:
             found = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             found += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
             for name in (module.split(".")[0] for module in found):
-                assert name in {*sys.stdlib_module_names, "numpy", "bpy", "mathutils"}, f"{path.name}: {name}"
+                assert name in {*sys.stdlib_module_names, "numpy", "bpy", "bmesh"}, f"{path.name}: {name}"
                 with_blender |= {path.name} if name == "bpy" else set()
     assert with_blender == {
         *("capture.py", "folders.py", "job.py", "lookup.py", "operators.py", "panel.py"),

@@ -253,7 +253,7 @@ def test_what_is_missing_is_said_before_anything_runs(tmp_path: Path, monkeypatc
     monkeypatch.setitem(PREFERENCES, "program", str(old))
     assert "is hood 0.0.9, the add-on needs 0.1.0 or newer" in refused()
     monkeypatch.setitem(PREFERENCES, "program", "")
-    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
     assert "hood is not installed; press Install hood" in refused()
     assert not skirt.modifiers
 
@@ -374,8 +374,8 @@ class Layout:
         self.texts.append(words.get("text", ""))
         return type("Properties", (), {})()
 
-    def template_list(self, kind: str, _: str, data: Any, rows: str, active: Any, index: str, **words: Any) -> None:
-        assert hasattr(data, rows)
+    def template_list(self, kind: str, _: str, data: Any, name: str, active: Any, index: str, **words: Any) -> None:
+        assert hasattr(data, name)
         assert hasattr(active, index)
 
     def label(self, text: str = "", **words: Any) -> None:
