@@ -107,12 +107,12 @@ def _run(plan: Plan, progress: Progress, captured: Captured) -> Iterator[float]:
     progress.runs = True
     try:
         yield from _watch(progress, running, collector)
+        collector.collect_all()
     finally:
         progress.runs = False
         if running.code is None:  # Blender ends, or the collector has failed
             running.interrupt()
             _end(running)
-        collector.collect_all()
         state.write_state(plan.folder, samples_there=collector.samples)
     if not progress.cancel:
         _judge(plan, progress, running, collector)
