@@ -82,7 +82,7 @@ class Collector:
             one.data.vertices.foreach_get("co", rest)
             cache = self.plan.folder / f"{garment.file}.pc2"
             made.append((one, rest.reshape(-1, 3), point_cache.GrowingCache(cache, len(mesh.number_of), self._kept)))
-        for one, rest, cache in made:
+        for one, _, cache in made:
             if not self.plan.keys and not self.plan.estimate:
                 results.remove_keys(one)
                 results.attach_cache(one, cache.path, self.plan.first)
