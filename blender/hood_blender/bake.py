@@ -64,15 +64,16 @@ def _check_hood(plan: Plan, progress: Progress) -> Iterator[float]:
     _KNOWN.add(known)
 
 
-def request_of(plan: Plan, scene: Any, samples: int) -> command.Request:
+def request_of(plan: Plan, scene: Any, captured: Captured) -> command.Request:
     """What hood is asked for."""
     scale = scale_of(scene)
     winds = [one for one in scene.objects if one.field is not None and one.field.type == "WIND"]
     fields = [(np.array(one.matrix_world.to_3x3().col[2].normalized()), float(one.field.strength)) for one in winds]
     garments = []
-    for garment in plan.garments:
-        names = meshes.part_names(garment.file, list(garment.slots))
-        garments.append(command.Garment(garment.file, garment.fabric, tuple(zip(names, garment.slots, strict=True))))
+    for garment, mesh in zip(plan.garments, captured.exported, strict=True):
+        parts = list(zip(meshes.part_names(garment.file, list(garment.slots)), garment.slots, strict=True))
+        used = tuple(part for number, part in enumerate(parts) if (mesh.part == number).any())
+        garments.append(command.Garment(garment.file, garment.fabric, used))
     try:
         gravity = gravity_of(tuple(scene.gravity), scene.use_gravity, scale)
     except ValueError as error:
@@ -81,7 +82,7 @@ def request_of(plan: Plan, scene: Any, samples: int) -> command.Request:
         tuple(garments),
         plan.last - plan.first + 1,
         fps_of(scene),
-        samples,
+        captured.samples,
         gravity,
         wind_of(fields, scale),
         plan.quality,
@@ -93,7 +94,7 @@ def request_of(plan: Plan, scene: Any, samples: int) -> command.Request:
 def _run(plan: Plan, progress: Progress, captured: Captured) -> Iterator[float]:
     """Run hood on what was captured; its frames come into the caches as it writes them."""
     scene = scene_named(plan.scene)
-    words = command.words_of(request_of(plan, scene, captured.samples))
+    words = command.words_of(request_of(plan, scene, captured))
     files = [command.BODY, command.PINS, *(f"{command.GARMENTS}/{garment.file}.obj" for garment in plan.garments)]
     key = state.run_key(plan.folder, words, files)
     kept = state.read_state(plan.folder)
@@ -106,12 +107,12 @@ def _run(plan: Plan, progress: Progress, captured: Captured) -> Iterator[float]:
     progress.runs = True
     try:
         yield from _watch(progress, running, collector)
+        collector.collect_all()
     finally:
         progress.runs = False
         if running.code is None:  # Blender ends, or the collector has failed
             running.interrupt()
             _end(running)
-        collector.collect_all()
         state.write_state(plan.folder, samples_there=collector.samples)
     if not progress.cancel:
         _judge(plan, progress, running, collector)

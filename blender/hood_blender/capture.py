@@ -177,6 +177,7 @@ def garment_mesh(scene: Any, layer: str, garment: Any, scale: float, origin: np.
         for key, mute in muted:
             key.mute = mute
         evaluated(scene, layer)
+    slot = np.clip(slot, 0, max(len(garment.material_slots) - 1, 0))
     slots = slot[polygon] if len(polygon) else np.zeros(0, np.int32)
     return export_mesh(garment.name, to_metres(pos, matrix, scale, origin), faces, slots, polygon, sew)
 

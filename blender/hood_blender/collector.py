@@ -33,9 +33,12 @@ class Collector:
             last = min(there, self.samples + most)
             if not self._caches:
                 self._begin(paths, headers)
-            for place, path in enumerate(paths):
-                assert path is not None
-                self._bring(place, point_cache.read_samples(path, self.samples, last))
+            try:
+                read = [point_cache.read_samples(path, self.samples, last) for path in paths if path is not None]
+            except FileNotFoundError:  # hood is about to put other files in their place
+                return self.samples
+            for place, samples in enumerate(read):
+                self._bring(place, samples)
             self.samples = last
             self._refresh()
         return self.samples
@@ -48,6 +51,12 @@ class Collector:
             self.collect()
 
     def _begin(self, paths: list[Any], headers: list[Any]) -> None:
+        """Begin the caches of all garments, or of none.
+
+        Raises:
+            BakeError: hood has made something else of a garment than was captured, or the garment has changed since.
+        """
+        made = []
         for garment, mesh, path, header in zip(self.plan.garments, self.captured.exported, paths, headers, strict=True):
             if header.points != len(mesh.pos):
                 raise BakeError(
@@ -71,12 +80,13 @@ class Collector:
                 )
             rest = np.empty(3 * len(one.data.vertices), np.float32)
             one.data.vertices.foreach_get("co", rest)
-            self._rest.append(rest.reshape(-1, 3))
             cache = self.plan.folder / f"{garment.file}.pc2"
-            self._caches.append(point_cache.GrowingCache(cache, len(mesh.number_of), self._kept))
+            made.append((one, rest.reshape(-1, 3), point_cache.GrowingCache(cache, len(mesh.number_of), self._kept)))
+        for one, _, cache in made:
             if not self.plan.keys and not self.plan.estimate:
                 results.remove_keys(one)
-                results.attach_cache(one, cache, self.plan.first)
+                results.attach_cache(one, cache.path, self.plan.first)
+        self._rest, self._caches = [rest for _, rest, _ in made], [cache for _, _, cache in made]
 
     def _bring(self, place: int, samples: np.ndarray) -> None:
         mesh, scale, origin = self.captured.exported[place], self.captured.scale, self.captured.origin

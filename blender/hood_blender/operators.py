@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import bmesh
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty
 
@@ -122,7 +123,7 @@ def _with_time(steps: Iterator[float], progress: Progress, scene: str) -> Iterat
     there = bpy.data.scenes.get(scene)
     if there is not None and progress.seconds_per_frame > 0:
         there.hood.seconds_per_frame = progress.seconds_per_frame
-    if not bpy.app.background:
+    if bpy.ops.ed.undo_push.poll():  # so that undoing the user's next step does not take the modifier off
         bpy.ops.ed.undo_push(message="hood bake")
 
 
@@ -202,19 +203,24 @@ class HOOD_OT_fault_select(bpy.types.Operator):
         garment.select_set(True)
         context.view_layer.objects.active = garment
         by_face = bool(fault.faces)
-        select_in(garment.data, fault.vertices, fault.faces)
         context.tool_settings.mesh_select_mode = (not by_face, False, by_face)
         bpy.ops.object.mode_set(mode="EDIT")
+        select_in(garment.data, fault.vertices, fault.faces)
         return {"FINISHED"}
 
 
 def select_in(mesh: Any, vertices: list[int], faces: list[int]) -> None:
-    """Select these vertices, or faces with what belongs to them, and nothing else."""
-    chosen = {*vertices, *(vertex for face in faces for vertex in mesh.polygons[face].vertices)}
-    mesh.polygons.foreach_set("select", [number in set(faces) for number in range(len(mesh.polygons))])
-    own = {edge for face in faces for edge in mesh.polygons[face].edge_keys}
-    mesh.edges.foreach_set("select", [edge.key in own for edge in mesh.edges])
-    mesh.vertices.foreach_set("select", [number in chosen for number in range(len(mesh.vertices))])
+    """Select these vertices, or faces, of a mesh in edit mode and nothing else."""
+    edited = bmesh.from_edit_mesh(mesh)
+    edited.verts.ensure_lookup_table()
+    edited.faces.ensure_lookup_table()
+    for kind in (edited.faces, edited.edges, edited.verts):
+        for one in kind:
+            one.select_set(False)
+    for chosen in [edited.faces[face] for face in faces] or [edited.verts[vertex] for vertex in vertices]:
+        chosen.select_set(True)
+    edited.select_flush_mode()
+    bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
 
 
 class HOOD_OT_fault_repair(bpy.types.Operator):

@@ -39,7 +39,7 @@ def attach_cache(garment: Any, cache: Path, first: int) -> None:
     ):
         if getattr(modifier, key) != value:
             setattr(modifier, key, value)
-    modifier.flip_axis = (False, False, False)
+    modifier.flip_axis = set() if isinstance(modifier.flip_axis, set) else (False, False, False)  # 4.2 has a set
     modifier.show_viewport = modifier.show_render = True
     refresh(garment)
 

@@ -52,5 +52,5 @@ def write_state(folder: Path, **changed: Any) -> None:
 def cache_of(folder: Path, name: str) -> Path | None:
     """The cache that hood writes for a garment; None while there is none. Where hood puts it is said here alone."""
     run = folder / command.RUN
-    places = (run / "rollout_pc2", run / ".partial.rollout_pc2", run)
+    places = (run / "rollout_pc2", run)
     return next((place / f"{name}.pc2" for place in places if (place / f"{name}.pc2").is_file()), None)

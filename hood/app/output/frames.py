@@ -80,12 +80,14 @@ def planned_steps(config: RolloutSettings, scene: Scene, count: int) -> StepPlan
 
 
 def _watched(scene: Scene) -> list[int]:
-    """Vertices whose every simulated position a report on events needs: those that are fastened, held or let go."""
+    """Vertices whose every simulated position the summary needs: those that are fastened, held, let go or in tables of pins."""
     found: set[int] = set()
     if scene.fastening is not None:
         found |= set(scene.fastening.pairs.edges.flatten().tolist())
     for grasp in () if scene.holding is None else scene.holding.grasps:
         found |= set(np.flatnonzero(grasp.vertices.cpu().numpy()).tolist())
+    for group in () if scene.held is None else scene.held.groups:
+        found |= set(group.vertices.tolist())
     return sorted(found)
 
 

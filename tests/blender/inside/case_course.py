@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -251,7 +253,7 @@ def test_what_is_missing_is_said_before_anything_runs(tmp_path: Path, monkeypatc
     monkeypatch.setitem(PREFERENCES, "program", str(old))
     assert "is hood 0.0.9, the add-on needs 0.1.0 or newer" in refused()
     monkeypatch.setitem(PREFERENCES, "program", "")
-    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
     assert "hood is not installed; press Install hood" in refused()
     assert not skirt.modifiers
 
@@ -353,6 +355,75 @@ def test_a_saved_file_keeps_a_relative_cache(tmp_path: Path) -> None:
     assert [row.object.name for row in bpy.context.scene.hood.garments] == ["Skirt"]
 
 
+class Layout:
+    """Stands for a layout of the interface: everything that is drawn has to be there."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def prop(self, data: Any, name: str, **words: Any) -> None:
+        assert hasattr(data, name), name
+
+    def prop_search(self, data: Any, name: str, where: Any, group: str) -> None:
+        assert hasattr(data, name)
+        assert hasattr(where, group)
+
+    def operator(self, name: str, **words: Any) -> Any:
+        room, _, own = name.partition(".")
+        assert own in dir(getattr(bpy.ops, room)), name
+        self.texts.append(words.get("text", ""))
+        return type("Properties", (), {})()
+
+    def template_list(self, kind: str, _: str, data: Any, name: str, active: Any, index: str, **words: Any) -> None:
+        assert hasattr(data, name)
+        assert hasattr(active, index)
+
+    def label(self, text: str = "", **words: Any) -> None:
+        self.texts.append(text)
+
+    def progress(self, factor: float, text: str) -> None:
+        assert 0.0 <= factor <= 1.0
+        self.texts.append(text)
+
+    def row(self, **words: Any) -> Layout:
+        return self
+
+    box = column = row
+
+
+def drawn() -> str:
+    """What the panel shows."""
+    layout = Layout()
+    bpy.types.HOOD_PT_main.draw(type("Panel", (), {"layout": layout})(), bpy.context)
+    return "\n".join(layout.texts)
+
+
+@quickly
+def test_the_panel_shows_garments_progress_time_and_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    made.fresh(last=30)
+    assert "Frames 1 to 30" in drawn()
+    body, _ = made.character()
+    skirt = made.skirt()
+    for name in ("a", "b"):
+        skirt.data.materials.append(bpy.data.materials.new(name))
+    settings = made.wear(body, skirt)
+    settings.garments[0].by_slot = True
+    assert len(settings.garments[0].slots) == 2
+    reasons = [{"kind": "strain", "sentence": "skirt: torn at vertex 3"}]
+    monkeypatch.setenv("QUICK_FAULTS", json.dumps(reasons))
+    monkeypatch.setenv("QUICK_SECONDS", "0.05")
+    one = begin()
+    move_until(one, lambda: one.progress.work == "Simulating")
+    assert "Simulating: " in drawn()
+    assert " of 30" in drawn()
+    one.wait()
+    shown = drawn()
+    assert "Frames 1 to 30: 0.1 s each, about 3 s" in shown
+    assert "skirt: torn at vertex 3" in shown
+    assert "Select 1 vertices" in shown
+    assert "5% larger" in shown
+
+
 @quickly
 def test_undo_between_two_bakes_leaves_one_modifier() -> None:
     made.fresh(last=3)
@@ -411,3 +482,26 @@ def test_an_installation_runs_its_commands_and_says_what_failed(tmp_path: Path, 
     with pytest.raises(RuntimeError, match=r"the installation failed: .*install\.txt"):
         bpy.ops.hood.install(wait=True)
     assert (tmp_path / "own" / "venv" / "pyvenv.cfg").is_file()
+
+
+def test_blender_installs_the_zip_and_switches_it_on(tmp_path: Path) -> None:
+    import make_zip
+
+    made_zip = make_zip.make_zip(tmp_path / "hood_blender.zip")
+    lines = [
+        "import bpy",
+        "bpy.ops.preferences.addon_enable(module='bl_pkg')",
+        f"bpy.ops.extensions.package_install_files(filepath={str(made_zip)!r}, repo='user_default', enable_on_install=True)",
+        "(name,) = [one for one in bpy.context.preferences.addons.keys() if 'hood' in one]",
+        "bpy.context.preferences.addons[name].preferences.program = 'named'",
+        "assert bpy.context.scene.hood.quality == 'standard'",
+        "assert bpy.ops.hood.body_set.poll()",
+        "bpy.ops.preferences.addon_disable(module=name)",
+        "assert not hasattr(bpy.types.Scene, 'hood')",
+        "print('it works')",
+    ]
+    environment = os.environ | {"BLENDER_USER_RESOURCES": str(tmp_path / "resources")}
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert "it works" in done.stdout, done.stdout + done.stderr
