@@ -32,10 +32,9 @@ from hood.media.renderer.render import (
     hem_distance,
     pixels_of,
     render_views,
-    smaller,
 )
-from hood.media.renderer.shading import Background
-from hood.media.video import VideoWriter, save_png
+from hood.media.renderer.shading import CLEAR, Background
+from hood.media.video import save_png, smaller, video_writer
 from hood.mesh.editing.subdivision import Extrusion
 from hood.mesh.topology import connected_components, counted_edges
 from hood.rollouts.file.reader import RolloutData
@@ -86,6 +85,15 @@ class Shots:
     camera: str = "follow"
     background: Background = None
     fabric_looks: bool = True
+
+    @classmethod
+    def of(cls, views: Sequence[str | float], camera: str, background: str | Sequence[int] | None, fabric_looks: bool) -> Shots:
+        """From the words of a command: a background is ``studio``, ``transparent``, or three numbers from 0 to 255."""
+        behind: Background = CLEAR if background == CLEAR else None
+        if background is not None and not isinstance(background, str):
+            red, green, blue = (channel / 255 for channel in background)
+            behind = (red, green, blue)
+        return cls(tuple(views), camera, behind, fabric_looks)
 
 
 class Film:
@@ -238,7 +246,7 @@ def write_sheet(film: Film, path: Path, known: Mapping[int, np.ndarray] | None =
 def write_video(
     film: Film, path: Path, frames: Iterable[int] | None = None, stride: int = 1, kept: Sequence[int] = ()
 ) -> tuple[Path, dict[int, np.ndarray]]:
-    """Video at the rollout's own speed; every ``stride``-th frame is drawn.
+    """Video at the rollout's own speed; every ``stride``-th frame is drawn. A path without a suffix is a folder of PNG files.
 
     Args:
         frames: the iterable that drives the loop (a progress bar, say); all frames by default.
@@ -248,7 +256,7 @@ def write_video(
     """
     chosen = range(0, len(film.data.cloth_pos), stride) if frames is None else frames
     pictures: dict[int, np.ndarray] = {}
-    with VideoWriter(path, fps=1.0 / (seconds_per_frame(film.data) * stride)) as writer:
+    with video_writer(path, fps=1.0 / (seconds_per_frame(film.data) * stride)) as writer:
         for index, picture in drawn(film, chosen):
             writer.append(picture)
             if index in kept:

@@ -308,20 +308,6 @@ def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str]
     return sheet
 
 
-def smaller(image: Picture, width: int, height: int) -> Picture:
-    """The picture in fewer pixels, each the mean of what it covers; seen through, it is put on white."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError(f"contact sheets need Pillow: {install('pictures')}") from error
-    if image.shape[2] == 4:
-        share = image[..., 3:] / 255.0
-        image = (share * image[..., :3] + (1.0 - share) * 255.0 + 0.5).astype(np.uint8)
-    if (width, height) == (image.shape[1], image.shape[0]):
-        return np.ascontiguousarray(image)
-    return np.asarray(Image.fromarray(np.ascontiguousarray(image)).resize((width, height), Image.Resampling.LANCZOS))
-
-
 def captioned(image: Picture, text: str) -> Picture:
     """A copy of the picture with a line of small text in its upper right corner."""
     size = max(11, image.shape[0] // 40)
