@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from hood.assets.formats.image import Texture
 from hood.media.colouring import colouring_of
-from hood.media.pieces import layer_distances, looks_of, pieces_of
+from hood.media.pieces import between_hems, layer_distances, looks_of, pieces_of
 from hood.media.renderer.render import (
     BODY_COLOR,
     FAR,
@@ -144,6 +144,7 @@ class Film:
             shown = np.nan_to_num(np.concatenate(cloths, axis=1), posinf=0.0, neginf=0.0)
         self._path = _smooth_path(shown)
         self._hem = np.full(len(number), FAR) if self.colouring else hem_distance(data.rest_pos, data.cloth_faces)
+        self._unsewn = None if self.colouring else between_hems(data.cloth_faces)
         self._closed = _is_closed(data.body_pos[0], data.body_faces)
         self._floor = float(shown[..., 1].min())
         if shots is not None:
@@ -158,6 +159,8 @@ class Film:
             solid = (self._layers[data.cloth_faces] == 0.0).all(axis=(1, 2))
             self._shell = Extrusion(data.cloth_faces, data.cloth_pos.shape[1], kept=solid)
             self._prints = [one.on(self._shell) for one in self._prints]
+            if self._unsewn is not None:
+                self._unsewn = np.flatnonzero(np.isin(self._shell.source[:, 0] // 3, self._unsewn))
 
     @property
     def _camera(self) -> Camera:
@@ -203,7 +206,7 @@ class Film:
         if shell is not None:
             pos, faces = shell.positions(pos, self._layers), shell.faces
             colour, hem, shine = (values[shell.vertex] for values in (colour, hem, shine))
-        return RenderMesh(pos, faces, colour, hem, 0.0, self._prints, shine)
+        return RenderMesh(pos, faces, colour, hem, 0.0, self._prints, shine, unsewn=self._unsewn)
 
     def sheet(self, count: int = _SHEET_FRAMES, columns: int = 6, known: Mapping[int, np.ndarray] | None = None) -> np.ndarray:
         """Contact sheet of ``count`` evenly spaced frames, of several views a row each; ``known`` are pictures that are there

@@ -187,6 +187,19 @@ def pieces_by(title: str, count: int, faces: np.ndarray, still: Mapping[str, np.
     return found
 
 
+def between_hems(faces: np.ndarray) -> np.ndarray:
+    """Numbers (N,) of faces beside an edge from hem to hem through the cloth: distances from the hem are 0 all along it, where
+    they are not along the way."""
+    corners = np.asarray(faces, dtype=np.int64)
+    edges, count = topology.counted_edges(corners)
+    at_hem = np.zeros(int(corners.max(initial=-1)) + 1, dtype=bool)
+    at_hem[edges[count == 1]] = True
+    bridges = edges[(count > 1) & at_hem[edges].all(axis=1)]
+    key = len(at_hem)
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1) @ np.array([key, 1])
+    return np.flatnonzero(np.isin(sides, bridges @ np.array([key, 1])).any(axis=1))
+
+
 def split_seams(faces: np.ndarray, uv_faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points to draw: a vertex on a seam of the texture is several.
 

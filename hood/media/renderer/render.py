@@ -195,7 +195,8 @@ class RenderMesh:
     next hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
     the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces. `shine`, (3,) or
     per vertex (V, 3): shares of the light in a broad and in a narrow highlight, and in what fibres scatter. Of a surface that
-    is `closed`, its faces counterclockwise from outside, the inner side is not drawn, which saves time.
+    is `closed`, its faces counterclockwise from outside, the inner side is not drawn, which saves time. Faces `unsewn` (N,)
+    have no lines of the hem.
     """
 
     pos: ArrayLike
@@ -206,6 +207,7 @@ class RenderMesh:
     prints: Sequence[Print] = ()
     shine: ArrayLike = (SHEEN, 0.0, FUZZ)
     closed: bool = False
+    unsewn: NDArray[np.int64] | None = None
 
 
 def render_frame(
@@ -353,6 +355,15 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
         faces, carrier, own = creased(pos, faces, normal)
         rows = [values[carrier] for values in (pos, linear, normal, hem, behind, shine)]
         rows[2][len(pos) :] = own
+        if mesh.unsewn is not None and len(mesh.unsewn):
+            alone = faces[mesh.unsewn].reshape(-1)
+            faces, first = np.array(faces), len(carrier)
+            faces[mesh.unsewn] = first + np.arange(len(alone)).reshape(-1, 3)
+            rows, carrier = (
+                [np.concatenate([values, values[alone]]) for values in rows],
+                np.concatenate([carrier, carrier[alone]]),
+            )
+            rows[3][first:] = FAR
         parts.append((rows[0], faces + offset, *rows[1:]))  # type: ignore[arg-type]
         offset += len(carrier)
     outer = takewhile(lambda mesh: mesh.closed, meshes)
