@@ -16,7 +16,7 @@ import torch
 from omegaconf import DictConfig
 
 from hood.app.settings.compose import SWEEP_FLAGS, ConfigError, brief, load_config, plain, require_choice
-from hood.app.settings.rollout_settings import Settings
+from hood.app.settings.rollout_settings import PictureSettings, Settings
 from hood.assets.files.atomic import occupy
 from hood.assets.files.said import install, say
 from hood.model.kernels.block import check_kernels, why_slow
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 #: ``checkpoint=untrained``: seeded random weights instead of a file.
 UNTRAINED = "untrained"
-_VIDEOS = ("mp4", "gif", "none")
+_VIDEOS = ("mp4", "gif", "png", "none")
 #: A body drawn thinner than this [mm] is another body.
 _THINNEST = 20.0
 
@@ -89,7 +89,7 @@ def frame_count(config: DictConfig) -> int | None:
 
 
 def video_of(config: Settings) -> tuple[str, int]:
-    """What ``video`` of a rollout says: mp4, gif or none, and of how many frames one is drawn.
+    """What ``video`` of a rollout says: mp4, gif, png or none, and of how many frames one is drawn.
 
     Raises:
         ConfigError: it says something else.
@@ -98,8 +98,8 @@ def video_of(config: Settings) -> tuple[str, int]:
     if not isinstance(value, list):
         require_choice(config, "video", _VIDEOS)
         return str(value), 1
-    if len(value) != 2 or value[0] not in _VIDEOS[:2] or type(value[1]) is not int or value[1] < 1:
-        raise ConfigError(f"video={brief(value)}: give mp4 or gif, and every how many frames is drawn, such as video=[mp4,3]")
+    if len(value) != 2 or value[0] not in _VIDEOS[:-1] or type(value[1]) is not int or value[1] < 1:
+        raise ConfigError(f"video={brief(value)}: give mp4, gif or png, and every how many frames, such as video=[mp4,3]")
     return str(value[0]), value[1]
 
 
@@ -128,15 +128,87 @@ def require_distinct(key: str, values: Sequence[Any]) -> None:
 
 
 def thinning(config: Settings) -> float:
-    """[m] of ``config.thin_body``, which is in millimetres.
+    """[m] of ``config.thin_body`` of a command that has it as a key, which is in millimetres.
 
     Raises:
         ConfigError: it is no such number.
     """
     value = config.thin_body
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= _THINNEST:
-        raise ConfigError(f"thin_body={value}: give millimetres, 0 (the body as it is) to {_THINNEST:g}")
+    is_right, fix = _PARTS["thin_body"]
+    if not is_right(value):
+        raise ConfigError(f"thin_body={value}: give {fix}")
     return 1e-3 * float(value)
+
+
+def picture_of(config: Settings, film: str = "mp4") -> PictureSettings:
+    """What ``picture`` says of films of a kind, with their width and height, and numbers within their bounds.
+
+    Raises:
+        ConfigError: a part of it is unknown, or has a value that it cannot have.
+    """
+    usual, value = PictureSettings(), plain(config.picture)
+    table = {} if value is None else value if isinstance(value, dict) else None
+    if table is None:
+        raise ConfigError(f"picture={brief(value)}: give a table, {{height:1080}}, of {', '.join(usual._fields)}")
+    strange = next((name for name in table if name not in usual._fields), None)
+    if strange is not None:
+        raise ConfigError(f"picture={brief(value)}: {strange!r} is no part of it; give some of {', '.join(usual._fields)}")
+    given = usual._replace(**{name: tuple(part) if isinstance(part, list) else part for name, part in table.items()})
+    views = given.views if isinstance(given.views, tuple) else (given.views,)
+    given = given._replace(views=views)
+    for name, (is_right, fix) in _PARTS.items():
+        if name in table and not is_right(getattr(given, name)):
+            raise ConfigError(f"picture={brief(value)}: {name}={brief(table[name])}; give {fix}")
+    width, height = (640, 360) if film == "gif" else (1280, 720)
+    if given.width is None and given.height is not None:  # one of them: the other in proportion, and even
+        width, height = 2 * round(given.height * width / height / 2), given.height
+    elif given.width is not None:
+        width, height = given.width, given.height or 2 * round(given.width * height / width / 2)
+    if width < _LEAST_VIEW * len(views):
+        raise ConfigError(f"picture={brief(value)}: width={width} is too small for {len(views)} views of {_LEAST_VIEW} pixels")
+    background = given.background or ("transparent" if film == "png" else "studio")
+    if background == "transparent" and film != "png":
+        raise ConfigError(f"picture={brief(value)}: video={film} cannot be transparent; add video=png, or give a colour")
+    return given._replace(width=width, height=height, background=background)
+
+
+def _is_size(value: Any) -> bool:
+    return value is None or (type(value) is int and 64 <= value <= 4096 and value % 2 == 0)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_view(value: Any) -> bool:
+    return value in _VIEWS if isinstance(value, str) else _is_number(value) and abs(value) <= 360
+
+
+def _is_background(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return len(value) == 3 and all(type(part) is int and 0 <= part <= 255 for part in value)
+    return value in (None, "studio", "transparent")
+
+
+_VIEWS = ("front", "side", "back", "turntable")
+_LEAST_VIEW = 64  # pixels
+_PIXELS = "an even number of pixels, 64 to 4096"
+#: Of parts of ``picture``: whether a value is right, and what is.
+_PARTS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "width": (_is_size, _PIXELS),
+    "height": (_is_size, _PIXELS),
+    "views": (
+        lambda views: 1 <= len(views) <= 4 and all(map(_is_view, views)),
+        f"one to four of {', '.join(_VIEWS)}, or degrees",
+    ),
+    "camera": (lambda value: value in ("follow", "fixed", "orbit"), "follow, fixed or orbit"),
+    "background": (_is_background, "studio, transparent, or [red,green,blue] from 0 to 255"),
+    "fabric_looks": (lambda value: isinstance(value, bool), "true or false"),
+    "thin_body": (
+        lambda value: _is_number(value) and 0 <= value <= _THINNEST,
+        f"millimetres, 0 (the body as it is) to {_THINNEST:g}",
+    ),
+}
 
 
 def prepare_folder(folder: Path) -> Path:

@@ -86,7 +86,7 @@ FORMAT = "hood-plan/1"
 _LIMIT = 1 << 20
 #: Keys that say nothing about the model, so they may be given beside a plan.
 FREE = (
-    "output", "num_frames", "guard", "fail_on", "resume", "metrics", "colour", "thin_body",
+    "output", "num_frames", "guard", "fail_on", "resume", "metrics", "colour", "picture",
     "video", "sheet", "output_fps", "refine_mesh", "formats", "texture",
 )  # fmt: skip
 

@@ -25,7 +25,7 @@ from hood.app.batch.batch import (
     with_one_stepper,
     write_overview,
 )
-from hood.app.common import output_folder, prepare_folder, thinning, together, video_of
+from hood.app.common import output_folder, picture_of, prepare_folder, together, video_of
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import (
     StreamedCaches,
@@ -412,16 +412,31 @@ def _draw(config: RolloutSettings, data: RolloutData, folder: Path, bar: Bar) ->
     if kind == "none" and not bool(config.sheet):
         return
     try:
-        from hood.media.film import Film, sheet_frames, write_sheet, write_video
+        from hood.media.film import Film, Shots, sheet_frames, write_sheet, write_video
     except ImportError as error:
         say(f"no pictures: {error}", error=True)
         return
-    film = Film(data, colour=str(config.colour), thinner=thinning(config), textures=lay_on(read_textures(config), [data])[0])
+    asked = picture_of(config, kind)
+    film = Film(
+        data,
+        asked.width or 0,
+        asked.height or 0,
+        colour=str(config.colour),
+        thinner=1e-3 * asked.thin_body,
+        textures=lay_on(read_textures(config), [data])[0],
+        shots=Shots.of(asked.views, asked.camera, asked.background, asked.fabric_looks),
+    )
     pictures: dict[int, Any] = {}
     if kind != "none":
         chosen = range(0, len(data.cloth_pos), stride)
         kept = sheet_frames(len(data.cloth_pos)) if bool(config.sheet) else ()
-        _, pictures = write_video(film, folder / f"rollout.{kind}", bar(chosen, len(chosen), "video"), stride, kept)
+        _, pictures = write_video(
+            film,
+            folder / ("rollout_png" if kind == "png" else f"rollout.{kind}"),
+            bar(chosen, len(chosen), "video"),
+            stride,
+            kept,
+        )
     if bool(config.sheet):
         write_sheet(film, folder / "contact_sheet.png", pictures)
 

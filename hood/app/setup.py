@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from hood.app.common import require_device, thinning, video_of
+from hood.app.common import picture_of, require_device, video_of
 from hood.app.notices import say
 from hood.app.output.frames import check_output_fps, check_refine_mesh
 from hood.app.output.verdict import FAIL_ON
@@ -60,7 +60,7 @@ class Setup:
 def check_config(config: RolloutSettings) -> None:
     """Raise ConfigError where keys of ``hood rollout`` have values that no rollout can have, before a file is read."""
     require_device(config)
-    video_of(config)
+    picture_of(config, video_of(config)[0])
     _check_metrics(config)
     start_of(config)
     require_choice(config, "fail_on", FAIL_ON)
@@ -231,7 +231,6 @@ def _check_numbers(config: RolloutSettings) -> None:
     for key, least in (("num_frames", 1), ("seed", 0)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
-    thinning(config)
     check_motion_options(config)
     check_output_fps(config)
     check_refine_mesh(config)

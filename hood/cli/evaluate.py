@@ -177,10 +177,10 @@ def _measure_unit(
 
 
 def _write_sheet(kept: KeptFrames, path: Path) -> None:
-    from hood.media.film import Film, write_sheet
+    from hood.media.film import Film, Shots, write_sheet
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_sheet(Film(kept.data()), path)
+    write_sheet(Film(kept.data(), 1280, 720, shots=Shots()), path)
 
 
 def _report(plan: Plan, measured: Mapping[EvaluationUnit, MeasuredRollout], folder: Path, overrides: Sequence[str]) -> None:

@@ -65,6 +65,7 @@ LOOKS = {
 }
 #: Of a garment of an outfit that has the fabric of an earlier one, this share of its colour is its own.
 _TOLD_APART = 0.5
+_ALIKE = 0.15  # distance of two colours that look alike
 
 #: In their order; far from the body's colour and from each other, in lightness as well.
 _OTHERS = ((0.80, 0.45, 0.22), (0.30, 0.52, 0.34), (0.62, 0.28, 0.42), (0.86, 0.74, 0.38), (0.28, 0.26, 0.42))
@@ -94,25 +95,31 @@ def part_colour(rank: int) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def looks_of(data: RolloutData) -> tuple[list[FabricLook], np.ndarray]:
+def looks_of(data: RolloutData, fabrics: bool = True) -> tuple[list[FabricLook], np.ndarray]:
     """Looks of the cloth of a rollout, and which of them a vertex (V,) has: by its fabric and its garment. Garments of the same
-    fabric differ in colour."""
+    fabric, or of one that looks like it, differ in colour.
+
+    Args:
+        fabrics: whether a fabric has a look of its own; else every garment has the colour of :func:`part_colour`.
+    """
     count = data.cloth_pos.shape[1]
     rank = outfit_ranks(str(data.attributes.get("garment", "")), data.cloth_faces, count, data.still.get("piece"))
     names, fabric = str(data.attributes.get("fabric_names", "")).split("+"), data.still.get("fabric")
     if fabric is None or fabric.shape != (count,) or not 0 <= fabric.min(initial=0) <= fabric.max(initial=0) < len(names):
         fabric = np.zeros(count, dtype=np.int64)
     pairs, number = np.unique(np.stack([rank, fabric], axis=1), axis=0, return_inverse=True)
-    looks, taken = [], set[str]()
+    looks, taken = [], list[tuple[int, np.ndarray]]()
     for garment, own in pairs.tolist():
-        look, mine = LOOKS.get(names[own]), np.array(part_colour(garment))
+        look, mine = LOOKS.get(names[own]) if fabrics else None, np.array(part_colour(garment))
         if look is None:
-            looks.append(FabricLook(part_colour(garment)))
+            known = LOOKS.get(names[own], FabricLook())
+            looks.append(FabricLook(part_colour(garment), thickness=known.thickness))
             continue
-        told = _TOLD_APART if garment and names[own] in taken else 0.0
-        red, green, blue = ((1.0 - told) * np.array(look.colour) + told * mine).tolist()
+        colour = np.array(look.colour)
+        near = any(other != garment and np.linalg.norm(colour - theirs) < _ALIKE for other, theirs in taken)
+        taken.append((garment, colour))
+        red, green, blue = ((1.0 - _TOLD_APART) * colour + _TOLD_APART * mine if near else colour).tolist()
         looks.append(replace(look, colour=(red, green, blue)))
-        taken.add(names[own])
     return looks, number.reshape(-1)
 
 
@@ -198,6 +205,19 @@ def hideable_parts(data: RolloutData, pieces: Sequence[GarmentPiece]) -> tuple[l
         for rank, kind, rides in rows.tolist()
     ]
     return names, part.reshape(-1)
+
+
+def between_hems(faces: np.ndarray) -> np.ndarray:
+    """Numbers (N,) of faces beside an edge from hem to hem through the cloth: distances from the hem are 0 all along it, where
+    they are not along the way."""
+    corners = np.asarray(faces, dtype=np.int64)
+    edges, count = topology.counted_edges(corners)
+    at_hem = np.zeros(int(corners.max(initial=-1)) + 1, dtype=bool)
+    at_hem[edges[count == 1]] = True
+    bridges = edges[(count > 1) & at_hem[edges].all(axis=1)]
+    key = len(at_hem)
+    sides = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1) @ np.array([key, 1])
+    return np.flatnonzero(np.isin(sides, bridges @ np.array([key, 1])).any(axis=1))
 
 
 def split_seams(faces: np.ndarray, uv_faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,10 +31,14 @@ BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]
     ),
     "frames of no video": (
         ["rollout", "video=[none,3]"],
-        ("video=[none,3]: give mp4 or gif, and every how many frames",),
+        ("video=[none,3]: give mp4, gif or png, and every how many frames",),
         None,
     ),
-    "video of no frames": (["rollout", "video=[mp4,0]"], ("video=[mp4,0]: give mp4 or gif, and every how many frames",), None),
+    "video of no frames": (
+        ["rollout", "video=[mp4,0]"],
+        ("video=[mp4,0]: give mp4, gif or png, and every how many frames",),
+        None,
+    ),
     "another video": (["rollout", "video=mp5"], ("unknown value for video 'mp5': did you mean 'mp4'",), None),
     "dashes": (["rollout", "--video=mp4"], ("write video=mp4",), None),
     "dashes before a file": (["view", "--fps=3"], ("write fps=3", "hood view --help"), None),

@@ -352,7 +352,7 @@ def read_checked(path: Path, colour: str) -> RolloutData:
     return data
 
 
-_NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "plan.json")
+_NAMES = ("summary.json", "contact_sheet.png", "rollout.mp4", "rollout.gif", "rollout_png", "plan.json")
 
 
 def remove_earlier(folder: Path, config: Settings, goes_on: bool = False) -> None:

@@ -133,6 +133,7 @@ _OLD = {
     "export": _Old("metrics", _part("metrics", "kind", "fields", []), _USUAL, _lacks("fields")),
     "cloth_friction": _Old("cloth_contact", _part("cloth_contact", "mode", "friction", 0.0), _USUAL, _lacks("friction")),
     "body_parts": _Old("objects", _part("objects", "garment", "body", []), _USUAL, _lacks("body")),
+    "thin_body": _Old("picture", _part("picture", "views", "thin_body", 0), _USUAL, _lacks("thin_body")),
     "accuracy": _Old("plan", lambda accuracy, _: accuracy, "null asks for no plan", lambda given: given == "auto"),
 }
 #: Those that ``hood inspect`` had as well.

@@ -80,7 +80,7 @@ class RolloutSettings(Mapping[str, Any]):
     metrics: Any
     colour: str
     texture: Any
-    thin_body: float
+    picture: Any
     video: Any
     sheet: bool
     refine_mesh: int
@@ -172,6 +172,26 @@ class Objects(NamedTuple):
 
     garment: tuple[str | int, ...] = ()
     body: tuple[str | int, ...] = ()
+
+
+class PictureSettings(NamedTuple):
+    """``picture``: how films and contact sheets show the body.
+
+    Args:
+        width, height: pixels; None: 1280 and 720, of GIF films half of them.
+        views, camera, fabric_looks: of :class:`hood.media.film.Shots`.
+        background: ``studio``, ``transparent``, or a colour, three numbers from 0 to 255; None: studio, of PNG
+            films transparent.
+        thin_body: mm by which the body is drawn thinner under the cloth.
+    """
+
+    views: tuple[str | float, ...] = ("front", "back")
+    width: int | None = None
+    height: int | None = None
+    camera: str = "follow"
+    background: str | tuple[int, ...] | None = None
+    fabric_looks: bool = True
+    thin_body: float = 0
 
 
 _Table = TypeVar("_Table", Refinement, Measurement, ClothContact, Objects)

@@ -153,7 +153,7 @@ def _rubs_what_is_kept_apart(config: RolloutSettings) -> bool:
 _ROLLOUT = (
     _Rule("fabrics_seam", lambda config: config.fabrics is not None, "fabrics are not given"),
     _Rule("metrics", _is_measured_as_asked, "the surface is measured with kind:all alone"),
-    _Rule("thin_body", _is_drawn, "nothing is drawn: video=none sheet=false"),
+    _Rule("picture", _is_drawn, "nothing is drawn: video=none sheet=false"),
     _Rule("colour", lambda config: _is_drawn(config) or str(config.colour) == "rg", "nothing is drawn: video=none sheet=false"),
     _Rule("cloth_contact", _rubs_what_is_kept_apart, "there is no friction with mode:off"),
 )

@@ -28,6 +28,8 @@ from hood.native.build import optional
 SOURCE = Path(native.__file__).with_name("picture.cpp")
 _Array = NDArray[np.float64]
 _TRIPLE = REAL * 3
+FloatArray = NDArray[np.floating]
+IntArray = NDArray[np.integer]
 #: Nothing closer to the camera than this is drawn [m].
 NEAR = 0.05
 
@@ -102,6 +104,12 @@ def unit(vectors: _Array) -> _Array:
     return vectors / np.sqrt(np.maximum(length_sq, 1e-24))
 
 
+def ends_of(points: FloatArray) -> tuple[_Array, _Array]:
+    """Lower and upper end (D,) of points (N, D)."""
+    columns = np.ascontiguousarray(points.T)  # numpy takes ten times as long along the other axis
+    return columns.min(axis=1), columns.max(axis=1)
+
+
 class LightValues(ctypes.Structure):
     """``Light`` of ``picture.cpp``."""
 
@@ -119,8 +127,9 @@ class SeenValues(ctypes.Structure):
 
     _fields_ = [
         *fields("pos color normal shine screen depth hem faces face nearness around axes own", POINTER),
-        *fields("width height num_around", COUNT),
+        *fields("width height num_around left top", COUNT),
         ("eye", _TRIPLE),
+        ("middle", REAL * 2),
         *fields("focal reach", REAL),
     ]
 
@@ -132,8 +141,9 @@ class FloorValues(ctypes.Structure):
         ("dark", POINTER),
         *fields("width height cells", COUNT),
         *fields("eye right up forward center", _TRIPLE),
+        ("kind", COUNT),
         *fields("tan_y floor cell", REAL),
-        *fields("ground horizon zenith", _TRIPLE),
+        *fields("ground horizon zenith plain", _TRIPLE),
     ]
 
 
@@ -143,12 +153,14 @@ def library() -> ctypes.CDLL | None:
     lib = optional(SOURCE)
     if lib is None:
         return None
-    lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 3, REAL, REAL, *[POINTER] * 2]
+    lib.picture_rasterise.argtypes = [*[POINTER] * 3, *[COUNT] * 4, REAL, REAL, *[POINTER] * 2]
     lib.picture_lit.argtypes = [POINTER, POINTER, COUNT, REAL, POINTER]
-    lib.picture_draw.argtypes = [POINTER] * 4
+    lib.picture_draw.argtypes = [*[POINTER] * 3, COUNT, POINTER]
     lib.picture_normals.argtypes = [*[POINTER] * 2, *[COUNT] * 2, POINTER]
     lib.picture_low.argtypes = [*[POINTER] * 2, COUNT, POINTER, REAL, REAL, COUNT, POINTER]
     lib.picture_most.argtypes = [POINTER, COUNT, POINTER]
+    lib.picture_creased.argtypes = [*[POINTER] * 2, *[COUNT] * 2, REAL, *[POINTER] * 3]
+    lib.picture_creased.restype = COUNT
     for name in ("picture_rasterise", "picture_lit", "picture_draw", "picture_normals", "picture_low", "picture_most"):
         getattr(lib, name).restype = None
     return lib
@@ -172,19 +184,18 @@ def filled(size: int, value: float, kind: type, place: str | None = None) -> NDA
     if place is None:
         return np.full(size, value, dtype=kind)
     memory = vars(_MEMORY).get(place)
-    if memory is None or memory.size != size:
-        memory = np.empty(size, dtype=kind)
+    if memory is None or memory.size < size:
+        memory = np.empty(size + size // 2, dtype=kind)
         setattr(_MEMORY, place, memory)
-    memory.fill(value)
-    return np.asarray(memory)
+    found: NDArray[Any] = memory[:size]
+    found.fill(value)
+    return found
 
-
-FloatArray = NDArray[np.floating]
-IntArray = NDArray[np.integer]
 
 # Columns this close to an edge [pixels] count as inside: shared edges leave no pinholes after rounding.
 _EDGE_TOLERANCE = 2e-3
 _MIN_AREA_PIXELS_SQ = 1e-9
+_ROOM = 16  # values behind a map that the compiled form may touch
 
 
 @dataclass(frozen=True)
@@ -203,6 +214,7 @@ def rasterise(
     height: int,
     chunk_faces: int = 32768,
     place: str | None = None,
+    closed: int = 0,
 ) -> VisibilityBuffer:
     """Nearest face of every pixel.
 
@@ -213,21 +225,34 @@ def rasterise(
         faces: (F, 3) vertex indices; degenerate faces are not drawn.
         chunk_faces: faces expanded at once, a bound on memory.
         place: of :func:`filled`: what was found there last is overwritten. None: in memory of its own.
+        closed: so many faces at the beginning are those of a closed surface: those seen from outside are drawn.
     """
-    best = filled(width * height, -np.inf, np.float64, place and f"{place} nearness")
-    owner = filled(width * height, -1, np.int32, place and f"{place} face")
-    lib = library()
+    lib, count = library(), width * height
     if lib is not None:
+        best = filled(count + _ROOM, -np.inf, np.float32, place and f"{place} nearness")
+        owner = filled(count + _ROOM, -1, np.int32, place and f"{place} face")
         points, near, corners = packed(screen), packed(nearness), packed(faces, np.int64)
-        inputs = address(points), address(near), address(corners), len(corners), width, height
+        inputs = address(points), address(near), address(corners), len(corners), closed, width, height
         lib.picture_rasterise(*inputs, _EDGE_TOLERANCE, _MIN_AREA_PIXELS_SQ, address(best), address(owner))
-        return VisibilityBuffer(owner.reshape(height, width), best.reshape(height, width))
-    for start in range(0, len(faces), chunk_faces):
-        pixel, value, face = _expand(screen, nearness, faces[start : start + chunk_faces], width, height)
+        return VisibilityBuffer(owner[:count].reshape(height, width), best[:count].reshape(height, width))
+    best, owner = np.full(count, -np.inf), np.full(count, -1, dtype=np.int32)
+    drawn = np.arange(len(faces))
+    if closed:
+        drawn = np.concatenate([np.flatnonzero(~from_behind(screen, faces[:closed])), drawn[closed:]])
+    for start in range(0, len(drawn), chunk_faces):
+        some = drawn[start : start + chunk_faces]
+        pixel, value, face = _expand(screen, nearness, faces[some], width, height)
         np.maximum.at(best, pixel, value)
         wins = value == best[pixel]
-        owner[pixel[wins]] = face[wins] + start
+        owner[pixel[wins]] = some[face[wins]]
     return VisibilityBuffer(owner.reshape(height, width), best.reshape(height, width))
+
+
+def from_behind(screen: FloatArray, faces: IntArray) -> NDArray[np.bool_]:
+    """(F,) whether a face is seen from behind: its corners go round clockwise there."""
+    a, b, c = (screen[faces[:, k]] for k in range(3))
+    turned: NDArray[np.bool_] = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    return turned
 
 
 def barycentric(screen: FloatArray, corners: IntArray, points: FloatArray) -> FloatArray:
@@ -298,3 +323,53 @@ def _ragged(counts: IntArray) -> tuple[IntArray, IntArray]:
     group = np.repeat(np.arange(len(counts)), counts)
     start = np.cumsum(counts) - counts
     return group, np.arange(len(group)) - start[group]
+
+
+#: A face whose normal has less than this [cosine] in common with the mean at a vertex is beyond a fold there.
+_CREASE = 0.5
+
+
+def vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
+    """Area-weighted unit normals (V, 3)."""
+    lib = library()
+    if lib is not None:
+        points, corners, found = packed(pos), packed(faces, np.int64), np.zeros_like(pos)
+        lib.picture_normals(address(points), address(corners), len(corners), len(points), address(found))
+        return found
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    face_normal = np.cross(b - a, c - a)
+    total = [
+        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
+    ]
+    return unit(np.stack(total, axis=1))
+
+
+def creased(pos: _Array, faces: NDArray[np.int64], normal: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64], _Array]:
+    """Faces with their own vertices where the mean normal (V, 3) of a vertex is not theirs, as in a pleat; the vertex (V + N,)
+    that each stands for, and the normals (N, 3) of the new ones."""
+    lib = library()
+    if lib is not None:
+        points, means, faces = packed(pos), packed(normal), np.array(faces, dtype=np.int64, order="C")
+        vertex, found = np.empty(faces.size, dtype=np.int64), np.empty((faces.size, 3))
+        places = (address(values) for values in (faces, vertex, found))
+        count = lib.picture_creased(address(points), address(means), len(faces), len(pos), _CREASE, *places)
+        return faces, np.concatenate([np.arange(len(pos)), vertex[:count]]), found[:count]
+    a, b, c = (pos[faces[:, k]] for k in range(3))
+    flat = unit(np.cross(b - a, c - a))
+    off = np.einsum("fx,fkx->fk", flat, normal[faces]) < _CREASE
+    off &= np.abs(flat).sum(axis=1, keepdims=True) > 0.5
+    own = np.argwhere(off)
+    if not len(own):
+        return faces, np.arange(len(pos)), np.zeros((0, 3))
+    vertex = faces[off]
+    order = np.argsort(faces, axis=None, kind="stable")
+    ends = np.searchsorted(faces.reshape(-1)[order], [vertex, vertex + 1])
+    count = ends[1] - ends[0]
+    row = np.repeat(np.arange(len(own)), count)
+    around = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - ends[0], count)] // 3
+    # Of the faces around the vertex those on this side of the fold share its normal.
+    alike = (flat[around] * flat[own[row, 0]]).sum(axis=1) > 0.5
+    sums = [np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)]
+    faces = faces.copy()
+    faces[off] = len(pos) + np.arange(len(own))
+    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(np.stack(sums, axis=1, dtype=np.float64))

@@ -1,9 +1,9 @@
 """Shaded pictures of a body and its clothing on a CPU: no display, no graphics card.
 
-Deferred shading: `raster.rasterise` finds the nearest face of every pixel at twice the resolution, then
-one vectorised pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a
-rim) and the floor behind them, darker in creases and where one surface lies near another. Lights turn
-with the camera, so that every view is lit from the upper left.
+Deferred shading: `raster.rasterise` finds the nearest face of every sample, of which a pixel has 2 x 2, then
+one pass lights the covered pixels (key light with a soft shadow map, sky and bounce light, a rim), once where
+their samples see one surface, and the floor behind them, darker in creases and where one surface lies near
+another. Lights turn with the camera, so that every view is lit from the upper left.
 
 The hems of a garment in pictures: how far its vertices are from them, and the lines along them.
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,18 +26,32 @@ from scipy.spatial import cKDTree
 from hood.assets.files.said import install
 from hood.assets.formats.image import Texture
 from hood.media.renderer.raster import (
-    NEAR,
     Camera,
     SeenValues,
     VisibilityBuffer,
     address,
-    barycentric,
+    creased,
+    from_behind,
     library,
     packed,
-    rasterise,
     unit,
+    vertex_normals,
 )
-from hood.media.renderer.shading import AROUND, REACH, Light, Surface, backdrop, dark_map, floor_values, openness
+from hood.media.renderer.shading import (
+    AROUND,
+    CLEAR,
+    REACH,
+    Background,
+    Light,
+    Nodes,
+    Surface,
+    backdrop,
+    dark_map,
+    floor_values,
+    node_pixels,
+    openness,
+)
+from hood.media.renderer.view import View
 from hood.mesh.editing.subdivision import Extrusion
 from hood.mesh.topology import connected_components, counted_edges
 
@@ -171,8 +185,6 @@ SHEEN, FUZZ = 0.06, 0.10
 
 #: Pixels are drawn in so many rows and columns.
 SUPERSAMPLING = 2
-#: A face whose normal has less than this [cosine] in common with the mean at a vertex is beyond a fold there.
-_CREASE = 0.5
 
 
 @dataclass(frozen=True)
@@ -182,7 +194,9 @@ class RenderMesh:
     Both sides are drawn, in one colour: a collar and a lapel show their inner side. `hem` (V,) [m] is the distance from the
     next hem, along which a line and a seam are drawn; without it there is none. `behind` [m] draws the surface farther from
     the eye than it is: what lies closer upon it is not cut by it. `prints` are images on some of its faces. `shine`, (3,) or
-    per vertex (V, 3): shares of the light in a broad and in a narrow highlight, and in what fibres scatter.
+    per vertex (V, 3): shares of the light in a broad and in a narrow highlight, and in what fibres scatter. Of a surface that
+    is `closed`, its faces counterclockwise from outside, the inner side is not drawn, which saves time. Faces `unsewn` (N,)
+    have no lines of the hem.
     """
 
     pos: ArrayLike
@@ -192,6 +206,8 @@ class RenderMesh:
     behind: float = 0.0
     prints: Sequence[Print] = ()
     shine: ArrayLike = (SHEEN, 0.0, FUZZ)
+    closed: bool = False
+    unsewn: NDArray[np.int64] | None = None
 
 
 def render_frame(
@@ -201,32 +217,78 @@ def render_frame(
     height: int = 640,
     *,
     floor: float | None = None,
+    background: Background = None,
 ) -> Picture:
-    """Draws the meshes above a floor; returns (height, width, 3) uint8.
+    """Draws the meshes above a floor; returns (height, width, 3) uint8, or 4 with straight alpha where they are seen through.
 
     Args:
         floor: height of the floor [m]. By default the lowest vertex drawn; give it for a film, where it must
             not move.
+        background: see :data:`hood.media.renderer.shading.Background`.
     """
+    return render_views(meshes, [camera], width, height, floor=floor, background=background)[0]
+
+
+def render_views(
+    meshes: Sequence[RenderMesh],
+    cameras: Sequence[Camera],
+    width: int,
+    height: int,
+    *,
+    floor: float | None = None,
+    background: Background = None,
+) -> list[Picture]:
+    """The same meshes from each camera, as :func:`render_frame` does."""
     surface = _join(meshes)
-    light = Light(camera, surface.pos, surface.faces, place="shadow")
-    floor_height = float(surface.pos[:, 1].min()) if floor is None else floor
+    floor_height = float(surface.ends[0][1]) if floor is None else floor
     firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
     prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
-    view = _View.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
-    lib = library()
-    if lib is not None:
-        dark, picture = dark_map(surface, floor_height), np.empty((height, width, 3), dtype=np.uint8)
-        floor_there = floor_values(camera, surface, floor_height, (width, height), dark)
+    dark, lib, pictures = dark_map(surface, floor_height), library(), []
+    for camera in cameras:
+        light = Light(camera, surface.pos, surface.faces, "shadow", surface.closed)
+        view = View.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
+        if lib is None:
+            pictures.append(_drawn(camera, light, surface, view, prints, floor_height, (width, height), dark, background))
+            continue
+        picture = np.empty((height, width, 4 if background == CLEAR else 3), dtype=np.uint8)
+        floor_there = floor_values(camera, surface, floor_height, (width, height), dark, background)
         seen, _alive = _seen_values(camera, surface, view, prints)
-        lib.picture_draw(*(ctypes.byref(value) for value in (light.values(), seen, floor_there)), address(picture))
-        return picture
-    image = backdrop(camera, light, surface, floor_height, width, height, SUPERSAMPLING)
-    _draw_surface(image, camera, light, surface, view, prints)
+        given = (ctypes.byref(value) for value in (light.values(), seen, floor_there))
+        lib.picture_draw(*given, len(surface.pos), address(picture))
+        pictures.append(picture)
+    return pictures
+
+
+def _drawn(
+    camera: Camera,
+    light: Light,
+    surface: Surface,
+    view: View,
+    prints: Sequence[tuple[int, Print]],
+    floor: float,
+    size: tuple[int, int],
+    dark: _Array,
+    background: Background,
+) -> Picture:
+    """The picture in numpy."""
+    image, clear = backdrop(camera, light, surface, floor, *size, dark, background), background == CLEAR
+    image = np.repeat(np.repeat(image, SUPERSAMPLING, axis=0), SUPERSAMPLING, axis=1)
+    covered = np.zeros(image.shape[:2])
+    part = slice(view.top, view.top + len(view.buffer.face)), slice(view.left, view.left + view.buffer.face.shape[1])
+    covered[part] = view.buffer.face >= 0
+    _draw_surface(image[part], camera, light, surface, view, prints)
+    share = _mean(covered)[..., None]
+    image = _mean(image) / (np.maximum(share, 1e-9) if clear else 1.0)
+    shown = (255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2) + 0.5).astype(np.uint8)
+    return np.concatenate([shown, (255.0 * share + 0.5).astype(np.uint8)], axis=2) if clear else shown
+
+
+def _mean(samples: _Array) -> _Array:
+    """Of the samples of every pixel."""
     steps = range(SUPERSAMPLING)
-    samples = [image[i::SUPERSAMPLING, j::SUPERSAMPLING] for i in steps for j in steps]
-    image = np.sum(samples, axis=0) / len(samples)
-    return (255.0 * np.clip(image, 0.0, 1.0) ** (1 / 2.2) + 0.5).astype(np.uint8)
+    every = [samples[i::SUPERSAMPLING, j::SUPERSAMPLING] for i in steps for j in steps]
+    mean: _Array = np.sum(every, axis=0) / len(every)
+    return mean
 
 
 def contact_sheet(images: Sequence[Picture], columns: int, labels: Sequence[str] | None = None) -> Picture:
@@ -289,62 +351,29 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
             raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
         behind = np.full(len(pos), mesh.behind)
         shine = np.broadcast_to(np.asarray(mesh.shine, dtype=np.float64), pos.shape)
-        normal = _vertex_normals(pos, faces)
-        faces, carrier, own = _creased(pos, faces, normal)
+        normal = vertex_normals(pos, faces)
+        faces, carrier, own = creased(pos, faces, normal)
         rows = [values[carrier] for values in (pos, linear, normal, hem, behind, shine)]
         rows[2][len(pos) :] = own
+        if mesh.unsewn is not None and len(mesh.unsewn):
+            alone = faces[mesh.unsewn].reshape(-1)
+            faces, first = np.array(faces), len(carrier)
+            faces[mesh.unsewn] = first + np.arange(len(alone)).reshape(-1, 3)
+            rows, carrier = (
+                [np.concatenate([values, values[alone]]) for values in rows],
+                np.concatenate([carrier, carrier[alone]]),
+            )
+            rows[3][first:] = FAR
         parts.append((rows[0], faces + offset, *rows[1:]))  # type: ignore[arg-type]
         offset += len(carrier)
-    return Surface(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-@dataclass(frozen=True)
-class _View:
-    """A surface as the camera sees it."""
-
-    number: NDArray[np.int64]  # (N,) of the faces that are not behind the camera
-    faces: NDArray[np.int64]  # (N, 3), these
-    screen: _Array  # (V, 2) pixels
-    depth: _Array  # (V,) m
-    buffer: VisibilityBuffer  # its faces are numbers of ``faces``
-    focal: float  # pixels that 1 m takes at a distance of 1 m
-
-    @classmethod
-    def of(cls, camera: Camera, surface: Surface, width: int, height: int) -> _View:
-        seen = (surface.pos - np.asarray(camera.position)) @ camera.axes().T
-        number = np.flatnonzero((seen[surface.faces, 2] > NEAR).all(axis=1))
-        faces, depth, focal = surface.faces[number], np.maximum(seen[:, 2], NEAR), camera.focal(height)
-        offset = focal * seen[:, :2] / depth[:, None]
-        screen = np.stack([0.5 * width + offset[:, 0], 0.5 * height - offset[:, 1]], axis=1)
-        buffer = rasterise(screen, 1.0 / (depth + surface.behind), faces, width, height, place="view")
-        return cls(number, faces, screen, depth, buffer, focal)
-
-    def first(self) -> NDArray[np.int64]:
-        """(H, W) number of the pixel that gives each pixel its colour: the first of its 2 x 2 that sees the same face."""
-        height, width = self.buffer.face.shape
-        four = self._fours(self.buffer.face)
-        first = (four[:, :, None] == four[:, None, :]).argmax(axis=2)
-        chosen = np.take_along_axis(self._fours(np.arange(height * width).reshape(height, width)), first, axis=1)
-        return np.asarray(chosen.reshape(height // 2, width // 2, 2, 2).swapaxes(1, 2).reshape(height, width))
-
-    @staticmethod
-    def _fours(values: NDArray[Any]) -> NDArray[Any]:
-        """(H W / 4, 4) of (H, W)."""
-        height, width = values.shape
-        return values.reshape(height // 2, 2, width // 2, 2).swapaxes(1, 2).reshape(-1, 4)
-
-    def covered(self) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.int64], _Array]:
-        """Row and column (P,) of the pixels that see a face and give it its colour, its corners (P, 3) and their shares
-        (P, 3)."""
-        own = self.first() == np.arange(self.buffer.face.size).reshape(self.buffer.face.shape)
-        row, column = np.nonzero((self.buffer.face >= 0) & own)
-        corners = self.faces[self.buffer.face[row, column]]
-        weights = barycentric(self.screen, corners, np.stack([column + 0.5, row + 0.5], axis=1)) / self.depth[corners]
-        return row, column, corners, np.clip(weights / (weights @ np.ones(3))[:, None], 0.0, 1.0)
+    outer = takewhile(lambda mesh: mesh.closed, meshes)
+    return Surface(
+        *(np.concatenate(column) for column in zip(*parts, strict=True)), sum(len(np.asarray(m.faces)) for m in outer)
+    )
 
 
 def _draw_surface(
-    image: _Array, camera: Camera, light: Light, surface: Surface, view: _View, prints: Sequence[tuple[int, Print]]
+    image: _Array, camera: Camera, light: Light, surface: Surface, view: View, prints: Sequence[tuple[int, Print]]
 ) -> None:
     row, column, corners, weights = view.covered()
     if len(row) == 0:
@@ -355,21 +384,47 @@ def _draw_surface(
     if prints:
         own = printed(prints, view.number[face], weights)
         color = np.where(np.isnan(own), color, own)
-    normal = unit(_blend(weights, surface.normal, corners))
+    normal = _normals(surface, view, row, column, corners, weights)
     to_eye = unit(np.asarray(camera.position) - pos)
-    a, b, c = (view.screen[view.faces[:, k]] for k in range(3))
-    turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) > (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    normal[turned[face]] *= -1.0
-    foot = np.asarray(1.0 / (view.focal * view.buffer.nearness[row, column]), dtype=np.float64)
-    color = sewn((weights * surface.hem[corners]).sum(axis=1), foot)[:, None] * color
-    open_share = openness(view.buffer, view.focal, row, column, normal @ axes.T)
+    near = np.asarray(view.buffer.nearness[row, column], dtype=np.float64)
+    color = sewn((weights * surface.hem[corners]).sum(axis=1), 1.0 / (view.focal * near))[:, None] * color
+    open_share, lit = _nodes(axes, light, surface, view).at(row, column, near, normal).T
     shine = _blend(weights, surface.shine, corners)
-    image[row, column] = light.shade(pos, normal, to_eye, color, shine, open_share)
+    image[row, column] = light.shade(normal, to_eye, color, shine, open_share, lit)
     image[:] = np.where(view.buffer.face[..., None] >= 0, image.reshape(-1, 3)[view.first()], image)
 
 
+def _normals(
+    surface: Surface,
+    view: View,
+    row: NDArray[np.integer],
+    column: NDArray[np.integer],
+    corners: NDArray[np.int64],
+    weights: _Array,
+) -> _Array:
+    """Unit normals (P, 3) of samples, towards the eye."""
+    normal = unit(_blend(weights, surface.normal, corners))
+    normal[from_behind(view.screen, view.faces)[view.buffer.face[row, column]]] *= -1.0
+    return normal
+
+
+def _nodes(axes: _Array, light: Light, surface: Surface, view: View) -> Nodes:
+    half = VisibilityBuffer(view.buffer.face[::2, ::2], view.buffer.nearness[::2, ::2])
+    there, rows, columns = node_pixels(half.face)
+    row, column = rows[there], columns[there]
+    corners, weights = view.seen(2 * row, 2 * column)
+    own = _normals(surface, view, 2 * row, 2 * column, corners, weights)
+    places = np.add.outer(np.arange(there.shape[0]), np.arange(there.shape[1]))[there] % 2
+    middle = 0.5 * view.middle[0], 0.5 * view.middle[1]
+    received, normal, nearness = np.ones((*there.shape, 2)), np.zeros((*there.shape, 3)), np.zeros(there.shape)
+    received[there, 0] = openness(half, 0.5 * view.focal, row, column, own @ axes.T, middle, places)
+    received[there, 1] = light.lit(_blend(weights, surface.pos, corners) + 0.006 * own, spread=0.9)
+    normal[there], nearness[there] = own, half.nearness[row, column]
+    return Nodes(there, received, nearness, normal)
+
+
 def _seen_values(
-    camera: Camera, surface: Surface, view: _View, prints: Sequence[tuple[int, Print]]
+    camera: Camera, surface: Surface, view: View, prints: Sequence[tuple[int, Print]]
 ) -> tuple[SeenValues, list[NDArray[np.generic]]]:
     """What :func:`_draw_surface` needs, for the compiled drawing, and the arrays that it points to."""
     height, width = view.buffer.face.shape
@@ -381,49 +436,12 @@ def _seen_values(
     seen = (surface.pos, surface.color, surface.normal, surface.shine, view.screen, view.depth, surface.hem)
     arrays = [packed(value) for value in seen]
     arrays += [packed(view.faces, np.int64), packed(view.buffer.face, np.int32)]
-    arrays += [packed(value) for value in (view.buffer.nearness, AROUND, camera.axes())] + ([] if own is None else [own])
+    arrays += [packed(view.buffer.nearness, np.float32)]
+    arrays += [packed(value) for value in (AROUND, camera.axes())] + ([] if own is None else [own])
     eye = tuple(float(value) for value in camera.position)
     addresses = [*(address(value) for value in arrays), *([None] if own is None else [])]
-    return SeenValues(*addresses, width, height, AROUND.shape[1], eye, view.focal, REACH), arrays
-
-
-def _vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
-    """Area-weighted unit normals (V, 3)."""
-    lib = library()
-    if lib is not None:
-        points, corners, found = packed(pos), packed(faces, np.int64), np.zeros_like(pos)
-        lib.picture_normals(address(points), address(corners), len(corners), len(points), address(found))
-        return found
-    a, b, c = (pos[faces[:, k]] for k in range(3))
-    face_normal = np.cross(b - a, c - a)
-    total = [
-        sum(np.bincount(faces[:, k], weights=face_normal[:, axis], minlength=len(pos)) for k in range(3)) for axis in range(3)
-    ]
-    return unit(np.stack(total, axis=1))
-
-
-def _creased(pos: _Array, faces: NDArray[np.int64], normal: _Array) -> tuple[NDArray[np.int64], NDArray[np.int64], _Array]:
-    """Faces with their own vertices where the mean normal (V, 3) of a vertex is not theirs, as in a pleat; the vertex (V + N,)
-    that each stands for, and the normals (N, 3) of the new ones."""
-    a, b, c = (pos[faces[:, k]] for k in range(3))
-    flat = unit(np.cross(b - a, c - a))
-    off = np.einsum("fx,fkx->fk", flat, normal[faces]) < _CREASE
-    off &= np.abs(flat).sum(axis=1, keepdims=True) > 0.5
-    own = np.argwhere(off)
-    if not len(own):
-        return faces, np.arange(len(pos)), np.zeros((0, 3))
-    vertex = faces[off]
-    order = np.argsort(faces, axis=None, kind="stable")
-    ends = np.searchsorted(faces.reshape(-1)[order], [vertex, vertex + 1])
-    count = ends[1] - ends[0]
-    row = np.repeat(np.arange(len(own)), count)
-    around = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - ends[0], count)] // 3
-    # Of the faces around the vertex those on this side of the fold share its normal.
-    alike = (flat[around] * flat[own[row, 0]]).sum(axis=1) > 0.5
-    sums = [np.bincount(row, np.where(alike, flat[around, axis], 0.0), len(own)) for axis in range(3)]
-    faces = faces.copy()
-    faces[off] = len(pos) + np.arange(len(own))
-    return faces, np.concatenate([np.arange(len(pos)), vertex]), unit(np.stack(sums, axis=1, dtype=np.float64))
+    sizes = width, height, AROUND.shape[1], view.left, view.top
+    return SeenValues(*addresses, *sizes, eye, view.middle, view.focal, REACH), arrays
 
 
 def _blend(weights: _Array, values: _Array, corners: NDArray[np.int64]) -> _Array:

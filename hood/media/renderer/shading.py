@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from hood.media.renderer.raster import (
     LightValues,
     VisibilityBuffer,
     address,
+    ends_of,
     library,
     packed,
     rasterise,
@@ -48,7 +50,13 @@ AROUND = np.ascontiguousarray(_around())
 
 
 def openness(
-    buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer], normal: _Array
+    buffer: VisibilityBuffer,
+    focal: float,
+    row: NDArray[np.integer],
+    column: NDArray[np.integer],
+    normal: _Array,
+    middle: tuple[float, float] | None = None,
+    place: NDArray[np.integer] | None = None,
 ) -> _Array:
     """Share (P,) of the light from all sides that reaches pixels: 1 in the open, less in creases and gaps.
 
@@ -61,10 +69,13 @@ def openness(
         focal: pixels that 1 m takes at a distance of 1 m.
         row, column: (P,) of the pixels, all of them covered.
         normal: (P, 3) towards the eye; right, up and forward.
+        middle: where the camera looks, across and down [pixels]; None: the middle of what is seen.
+        place: (P,) which of :data:`AROUND` a pixel looks at; None: by its place in its 2 x 2.
     """
     height, width = buffer.face.shape
-    pos = _positions(buffer, focal, row, column)
-    place = 2 * (row % 2) + column % 2
+    middle = (0.5 * width, 0.5 * height) if middle is None else middle
+    pos = _positions(buffer, focal, row, column, middle)
+    place = 2 * (row % 2) + column % 2 if place is None else place
     offset = np.concatenate([AROUND[place], AROUND[3 - place]], axis=1)
     reach = focal * REACH / pos[:, 2]
     kept = np.zeros(len(row))
@@ -73,7 +84,7 @@ def openness(
         r = np.floor(row + 0.5 + reach * offset[:, k, 1]).astype(np.int64)
         at = np.flatnonzero((c >= 0) & (r >= 0) & (c < width) & (r < height))
         at = at[buffer.face[r[at], c[at]] >= 0]
-        away = _positions(buffer, focal, r[at], c[at]) - pos[at]
+        away = _positions(buffer, focal, r[at], c[at], middle) - pos[at]
         dist_sq = np.einsum("pi,pi->p", away, away)
         share = np.maximum(1.0 - dist_sq / REACH**2, 0.0)
         above = np.einsum("pi,pi->p", normal[at], away) / np.sqrt(np.maximum(dist_sq, 1e-300))
@@ -81,11 +92,60 @@ def openness(
     return np.clip(1.0 - _STRENGTH * kept / (2 * _COUNT), _DARKEST, 1.0)
 
 
-def _positions(buffer: VisibilityBuffer, focal: float, row: NDArray[np.integer], column: NDArray[np.integer]) -> _Array:
+@dataclass(frozen=True)
+class Nodes:
+    """What light arrives, computed once for every block of 2 x 2 pixels, and interpolated between blocks of one surface.
+
+    Args:
+        there: (R, C) whether a block sees anything at its node; what else there is of those that do not is not read.
+        light: (R, C, 2) shares of the light from all sides and of the key light.
+        nearness: (R, C) 1/m, and unit ``normal`` (R, C, 3).
+    """
+
+    there: NDArray[np.bool_]
+    light: _Array
+    nearness: _Array
+    normal: _Array
+
+    def at(self, row: NDArray[np.integer], column: NDArray[np.integer], nearness: _Array, normal: _Array) -> _Array:
+        """(P, 2) at samples, of which a pixel has 2 x 2, with their nearness and normal (P, 3)."""
+        r, c = row // 2, column // 2
+        total, found = np.zeros(len(row)), np.zeros((len(row), 2))
+        for down in (0, 1):
+            for across in (0, 1):
+                i = r // 2 + down * np.where(r % 2 == 1, 1, -1)
+                j = c // 2 + across * np.where(c % 2 == 1, 1, -1)
+                inside = (i >= 0) & (j >= 0) & (i < self.there.shape[0]) & (j < self.there.shape[1])
+                i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+                other = (np.abs(self.nearness[i, j] - nearness) > 0.005 * nearness) | (_dot(self.normal[i, j], normal) < 0.5)
+                share = (0.25 if down else 0.75) * (0.25 if across else 0.75) * np.where(other, 1e-3, 1.0)
+                share = np.where(inside & self.there[i, j], share, 0.0)
+                found += share[:, None] * self.light[i, j]
+                total += share
+        return np.where(total[:, None] > 0, found / np.maximum(total, 1e-12)[:, None], 1.0)
+
+
+def node_pixels(face: NDArray[np.integer]) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Of faces (H, W) that the first samples of pixels see: which blocks (R, C) have a node, and row and column (R, C) of the
+    pixel where it is, the first of the block that sees anything."""
+    rows, columns = -(-face.shape[0] // 2), -(-face.shape[1] // 2)
+    seen = np.zeros((2 * rows, 2 * columns), dtype=bool)
+    seen[: face.shape[0], : face.shape[1]] = face >= 0
+    four = seen.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)
+    first = four.argmax(axis=2)
+    return four.any(axis=2), 2 * np.arange(rows)[:, None] + first // 2, 2 * np.arange(columns)[None] + first % 2
+
+
+def _positions(
+    buffer: VisibilityBuffer,
+    focal: float,
+    row: NDArray[np.integer],
+    column: NDArray[np.integer],
+    middle: tuple[float, float],
+) -> _Array:
     """Seen points (P, 3) [m] right, up and forward of the eye."""
-    height, width = buffer.face.shape
     depth = 1.0 / buffer.nearness[row, column]
-    return np.stack([(column + 0.5 - 0.5 * width) / focal * depth, (0.5 * height - row - 0.5) / focal * depth, depth], axis=1)
+    return np.stack([(column + 0.5 - middle[0]) / focal * depth, (middle[1] - row - 0.5) / focal * depth, depth], axis=1)
 
 
 _Faces = NDArray[np.int64]
@@ -109,9 +169,9 @@ _BOUNCE = 0.18 * np.array([1.0, 0.97, 0.94])
 
 @dataclass(frozen=True)
 class Surface:
-    """Everything drawn as one mesh: `pos` (V, 3), `faces` (F, 3), linear `color` and unit `normal` (V, 3), distance from
-    the next `hem` and how far the vertices are drawn `behind` where they are (V,) [m], and how they `shine` (V, 3), as a
-    :class:`hood.media.renderer.render.RenderMesh`."""
+    """Everything drawn as one mesh, whose first `closed` faces are those of closed surfaces: `pos` (V, 3), `faces` (F, 3),
+    linear `color` and unit `normal` (V, 3), distance from the next `hem` and how far the vertices are drawn `behind` where
+    they are (V,) [m], and how they `shine` (V, 3), as a :class:`hood.media.renderer.render.RenderMesh`."""
 
     pos: _Array
     faces: _Faces
@@ -120,6 +180,12 @@ class Surface:
     hem: _Array
     behind: _Array
     shine: _Array
+    closed: int = 0
+
+    @cached_property
+    def ends(self) -> tuple[_Array, _Array]:
+        """Of its box (3,)."""
+        return ends_of(self.pos)
 
 
 def _most_near(nearness: FloatArray) -> _Array:
@@ -140,22 +206,23 @@ class Light:
     """A key light with a shadow map, a fill light, a hemisphere of sky and bounce light, and a rim.
 
     Args:
-        pos: (V, 3) m of the surface that throws shadows; ``faces`` (F, 3).
+        pos: (V, 3) m of the surface that throws shadows; ``faces`` (F, 3), ``closed`` as for
+            :func:`hood.media.renderer.raster.rasterise`.
         place: of :func:`hood.media.renderer.raster.filled`, for the shadow map; the next light of that place overwrites it.
     """
 
-    def __init__(self, camera: Camera, pos: _Array, faces: NDArray[np.int64], place: str | None = None):
+    def __init__(self, camera: Camera, pos: _Array, faces: NDArray[np.int64], place: str | None = None, closed: int = 0):
         right, _, forward = camera.axes()
         flat_forward = unit(np.array([forward[0], 0.0, forward[2]]) + 1e-9)
         self.key = unit(-0.55 * right + 1.0 * np.array([0.0, 1.0, 0.0]) - 0.75 * flat_forward)
         self.fill = unit(0.9 * right + 0.25 * np.array([0.0, 1.0, 0.0]) - 0.6 * flat_forward)
-        self._axes = packed(view_axes(-self.key))
+        self._axes = packed(view_axes(-self.key) * [[1.0], [-1.0], [1.0]])  # the map's rows go down, as those of pictures
         seen = pos @ self._axes.T
-        self._low = seen[:, :2].min(axis=0)
-        extent = float((seen[:, :2].max(axis=0) - self._low).max()) + 1e-6
+        self._low, high = ends_of(seen[:, :2])
+        extent = float((high - self._low).max()) + 1e-6
         self._scale = (_SHADOW_SIZE - 8) / extent
         screen = (seen[:, :2] - self._low) * self._scale + 4.0
-        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE, place=place).nearness
+        self._map = rasterise(screen, -seen[:, 2], faces, _SHADOW_SIZE, _SHADOW_SIZE, place=place, closed=closed).nearness
         self._texel = 1.0 / self._scale
         self._most = _most_near(self._map)
 
@@ -183,17 +250,18 @@ class Light:
             shade += self._map[row, column] > bias - seen[:, 2]
         return 1.0 - shade / len(_PROBES)
 
-    def shade(self, pos: _Array, normal: _Array, view: _Array, color: _Array, shine: _Array, openness: _Array) -> _Array:
+    def shade(self, normal: _Array, view: _Array, color: _Array, shine: _Array, openness: _Array, lit: _Array) -> _Array:
         """Linear colours (P, 3) of points with these unit normals, directions to the eye and colours.
 
         Args:
             shine: (P, 3) shares of the light in a broad and in a narrow highlight, and scattered at a grazing angle.
             openness: (P,) share of the light from all sides that is not kept off by what is near.
+            lit: (P,) share of the key light that is not in shadow.
         """
         key = normal @ self.key
         # Wrapped diffuse light: soft terminators, as under a large lamp.
         diffuse = np.clip((key + 0.25) / 1.25, 0.0, 1.0)
-        shadow = (0.25 + 0.75 * self.lit(pos + 0.006 * normal, spread=0.9)) * (0.5 + 0.5 * openness)
+        shadow = (0.25 + 0.75 * lit) * (0.5 + 0.5 * openness)
         fill = np.clip(normal @ self.fill, 0.0, 1.0)
         up = 0.5 + 0.5 * normal[:, 1]
         facing = np.clip(_dot(normal, view), 0.0, 1.0)
@@ -206,64 +274,114 @@ class Light:
         return color * received * (0.72 + 0.28 * facing[:, None]) + (gloss + rim)[:, None]
 
 
-def floor_values(camera: Camera, surface: Surface, floor: float, size: tuple[int, int], dark: _Array) -> FloorValues:
+#: What is behind a surface: None for the floor and the sky of a studio, a colour (sRGB, 0 to 1) with the shade on the floor, or
+#: :data:`CLEAR` for nothing, seen through.
+Background = tuple[float, float, float] | str | None
+CLEAR = "transparent"
+
+
+def floor_values(
+    camera: Camera, surface: Surface, floor: float, size: tuple[int, int], dark: _Array, background: Background
+) -> FloorValues:
     """What :func:`backdrop` needs, for the compiled drawing of pictures of this ``size`` (width, height); ``dark`` is
     :func:`dark_map`, and lives as long."""
     where = (tuple(value) for value in (camera.position, *camera.axes(), _middle(surface)))
-    colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH))
-    tan_y = float(np.tan(np.radians(camera.fov) / 2))
-    return FloorValues(address(dark), *size, len(dark), *where, tan_y, floor, _CELL, *colors)
+    colors = (tuple(value) for value in (_GROUND**2.2, _HORIZON, _ZENITH, _plain(background)))
+    tan_y, kind = float(np.tan(np.radians(camera.fov) / 2)), 0 if background is None else 2 if background == CLEAR else 1
+    return FloorValues(address(dark), *size, len(dark), *where, kind, tan_y, floor, _CELL, *colors)
 
 
-def backdrop(camera: Camera, light: Light, surface: Surface, floor: float, width: int, height: int, samples: int) -> _Array:
-    """Linear colours (samples * height, samples * width, 3) of the floor, which fades into a plain background.
+def _plain(background: Background) -> _Array:
+    """Linear (3,)."""
+    return np.array(background if isinstance(background, tuple) else (0.0, 0.0, 0.0), dtype=np.float64) ** 2.2
 
-    A pixel of the picture of this ``width`` and ``height`` has one colour, in all its ``samples`` rows and columns.
+
+#: Rows and columns of pixels from a node of the background to the next one, as in picture.cpp.
+_DOWN, _ACROSS = 2, 4
+
+
+def backdrop(
+    camera: Camera,
+    light: Light,
+    surface: Surface,
+    floor: float,
+    width: int,
+    height: int,
+    dark: _Array,
+    background: Background = None,
+) -> _Array:
+    """Linear colours (height, width, 3) of the floor, which fades into a plain background.
+
+    All but the lines on the floor is computed at nodes, and interpolated between them.
     """
-    right, up, forward = camera.axes()
-    tan_y = np.tan(np.radians(camera.fov) / 2)
-    x = (np.arange(width) + 0.5 - 0.5 * width) / (0.5 * height) * tan_y
-    y = (0.5 * height - np.arange(height) - 0.5) / (0.5 * height) * tan_y
-    rays = forward + x[None, :, None] * right + y[:, None, None] * up
-    slope = rays[..., 1] / np.linalg.norm(rays, axis=-1)
-    image = (_HORIZON + (_ZENITH - _HORIZON) * np.clip(1.6 * slope, 0.0, 1.0)[..., None]) ** 2.2
-
-    eye = np.asarray(camera.position)
+    rows, columns = np.arange(0, height + _DOWN, _DOWN), np.arange(0, width + _ACROSS, _ACROSS)
+    rays, _ = _rays(camera, rows, columns, width, height)
+    image = np.broadcast_to(_plain(background), rays.shape).copy()
+    if background is None:
+        slope = rays[..., 1] / np.linalg.norm(rays, axis=-1)
+        image = (_HORIZON + (_ZENITH - _HORIZON) * np.clip(1.6 * slope, 0.0, 1.0)[..., None]) ** 2.2
+    lines, eye = np.zeros(image.shape[:2]), np.asarray(camera.position)
     drop = eye[1] - floor
-    row, column = np.nonzero(rays[..., 1] < -1e-4)
-    if drop < 1e-3:
-        return _repeated(image, samples)
-    reach = drop / -rays[row, column, 1]
-    pos = eye + reach[:, None] * rays[row, column]
-    pixel = reach * 2.0 * tan_y / height
-    center = _middle(surface)
-    away = np.hypot(pos[:, 0] - center[0], pos[:, 2] - center[2])
-    fade = np.exp(-((away / 3.2) ** 2))
-    ground = _GROUND**2.2 * (1.0 - 0.16 * _grid_lines(pos, pixel, reach / drop) * fade)[:, None]
-    ground *= _floor_shadow(light, surface, pos, floor, away)[:, None]
-    blend = np.clip(fade, 0.0, 1.0)[:, None]
-    image[row, column] = blend * ground + (1.0 - blend) * image[row, column]
-    return _repeated(image, samples)
+    if drop >= 1e-3:
+        row, column = np.nonzero(rays[..., 1] < -1e-4)
+        pos = eye + (drop / -rays[row, column, 1])[:, None] * rays[row, column]
+        center = _middle(surface)
+        away = np.hypot(pos[:, 0] - center[0], pos[:, 2] - center[2])
+        left = _floor_shadow(light, surface, pos, dark, away)
+        fade = np.exp(-((away / 3.2) ** 2))
+        if background is None:
+            image[row, column] = (fade * left)[:, None] * _GROUND**2.2 + (1.0 - fade)[:, None] * image[row, column]
+            lines[row, column] = 0.16 * fade**2 * left
+        else:
+            image[row, column] *= left[:, None]
+    bare = np.clip(image, 0.0, 1.0) ** (1 / 2.2)  # between nodes as it is shown
+    lined = np.clip(image - lines[..., None] * _GROUND**2.2, 0.0, 1.0) ** (1 / 2.2)
+    shown = _between(bare, width, height)
+    if background is None and drop >= 1e-3:
+        shown += _grid_lines(camera, drop, width, height)[..., None] * _between(lined - bare, width, height)
+    result: _Array = shown**2.2
+    return result
 
 
-def _repeated(image: _Array, samples: int) -> _Array:
-    return np.repeat(np.repeat(image, samples, axis=0), samples, axis=1)
+def _rays(
+    camera: Camera, rows: NDArray[np.integer], columns: NDArray[np.integer], width: int, height: int
+) -> tuple[_Array, float]:
+    """Rays (R, C, 3) through pixels, and how far apart they are."""
+    right, up, forward = camera.axes()
+    per_pixel = float(np.tan(np.radians(camera.fov) / 2)) / (0.5 * height)
+    x, y = (columns + 0.5 - 0.5 * width) * per_pixel, (0.5 * height - rows - 0.5) * per_pixel
+    return forward + x[None, :, None] * right + y[:, None, None] * up, per_pixel
 
 
-def _grid_lines(pos: _Array, pixel: _Array, stretch: _Array) -> _Array:
-    """Coverage of 1 cm lines every half metre, smoothed over the pixel's footprint."""
-    lines = np.zeros(len(pos))
-    foot = np.maximum(pixel, 1e-4) * np.sqrt(np.maximum(stretch, 1.0))
+def _between(nodes: _Array, width: int, height: int) -> _Array:
+    """Values (height, width, N) of pixels from those of nodes, linear between them."""
+    row, down = np.divmod(np.arange(height), _DOWN)
+    column, across = np.divmod(np.arange(width), _ACROSS)
+    part = (down / _DOWN)[:, None, None]
+    rows = nodes[row] + part * (nodes[row + 1] - nodes[row])
+    share = (across / _ACROSS)[None, :, None]
+    result: _Array = rows[:, column] + share * (rows[:, column + 1] - rows[:, column])
+    return result
+
+
+def _grid_lines(camera: Camera, drop: float, width: int, height: int) -> _Array:
+    """Coverage (height, width) of 1 cm lines every half metre, smoothed over the pixel's footprint."""
+    rays, per_pixel = _rays(camera, np.arange(height), np.arange(width), width, height)
+    lines = np.zeros((height, width))
+    low = np.flatnonzero(rays[:, 0, 1] < -1e-4)  # rows: the camera is upright
+    reach = drop / -rays[low, 0, 1]
+    pos = np.asarray(camera.position) + reach[:, None, None] * rays[low]
+    foot = np.maximum(reach * per_pixel, 1e-4) * np.sqrt(np.maximum(reach / drop, 1.0))
     for axis in (0, 2):
-        offset = np.abs((pos[:, axis] / 0.5 + 0.5) % 1.0 - 0.5) * 0.5
-        cover = np.clip((0.005 - offset) / foot + 0.5, 0.0, 1.0) * np.minimum(1.0, 0.01 / foot)
-        lines = np.maximum(lines, cover)
+        offset = np.abs((pos[..., axis] / 0.5 + 0.5) % 1.0 - 0.5) * 0.5
+        cover = np.clip((0.005 - offset) / foot[:, None] + 0.5, 0.0, 1.0) * np.minimum(1.0, 0.01 / foot)[:, None]
+        lines[low] = np.maximum(lines[low], cover)
     return lines
 
 
-def _floor_shadow(light: Light, surface: Surface, pos: _Array, floor: float, away: _Array) -> _Array:
+def _floor_shadow(light: Light, surface: Surface, pos: _Array, dark: _Array, away: _Array) -> _Array:
     """What is left of the light on the floor: the cast shadow, and a soft dark patch under low parts."""
-    dark, center = dark_map(surface, floor), _middle(surface)
+    center = _middle(surface)
     at = (pos[:, [2, 0]] - center[[2, 0]]) / _CELL + _DARK_SIZE / 2 - 0.5
     left = 1.0 - np.clip(_sample(dark, at), 0.0, 0.6)
     near = away < 3.0
@@ -296,7 +414,7 @@ def _low(surface: Surface, floor: float, center: _Array) -> _Array:
 
 def _middle(surface: Surface) -> _Array:
     """Of the box that holds the surface, (3,)."""
-    middle: _Array = 0.5 * (surface.pos.min(axis=0) + surface.pos.max(axis=0))
+    middle: _Array = 0.5 * np.add(*surface.ends)
     return middle
 
 

@@ -63,7 +63,7 @@ def test_what_was_not_measured_is_not_claimed() -> None:
     ("key", "words"),
     [
         ("metrics={surface_every:0}", "surface_every is 0; it must be at least 1"),
-        ("thin_body=-1", "give millimetres, 0"),
+        ("picture={thin_body:-1}", "give millimetres, 0"),
         ("thin_body=50", "to 20"),
     ],
 )

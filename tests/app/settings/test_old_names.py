@@ -112,6 +112,7 @@ def unsaid() -> None:
             "cloth_friction=0.5 is called cloth_contact={mode:on,friction:0.5} now",
         ),
         ("body_parts=[Body]", "objects={body:[Body]}", "body_parts=[Body] is called objects={body:[Body]} now"),
+        ("thin_body=8", "picture={thin_body:8}", "thin_body=8 is called picture={thin_body:8} now"),
         (
             "objects=[tank] body_parts=[Body]",
             "objects={garment:[tank],body:[Body]}",
@@ -198,6 +199,7 @@ THEN = {
     "export": [],
     "cloth_friction": 0.0,
     "body_parts": [],
+    "thin_body": 0,
     "accuracy": None,
 }
 
@@ -256,7 +258,7 @@ def test_records_of_then_are_read_as_those_of_today(then: dict[str, object], tod
         ("relaxing_steps=[1", "close every bracket"),
         ("relaxing_steps=many", "unknown value for settle 'many'"),
         ("budget_ms=soon", "refine=soonms: give a whole number of iterations"),
-        ("video_stride=0", r"video=\[mp4,0\]: give mp4 or gif"),
+        ("video_stride=0", r"video=\[mp4,0\]: give mp4, gif or png"),
         ("doubts=never", "unknown value for fail_on 'never'"),
         ("body_scale=x", "unit=x: give m, cm, mm"),
     ],

@@ -30,7 +30,7 @@ IDLE = [
         ["metrics={kind:strain,surface_every:2}"],
         "metrics={kind:strain,surface_every:2} has no effect: the surface is measured with kind:all alone",
     ),
-    (["video=none", "sheet=false", "thin_body=8"], "thin_body=8 has no effect: nothing is drawn"),
+    (["video=none", "sheet=false", "picture={thin_body:8}"], "picture={thin_body:8} has no effect: nothing is drawn"),
     (["video=none", "sheet=false", "colour=strain"], "colour=strain has no effect: nothing is drawn"),
     (
         ["cloth_contact={mode:off,friction:0.5}"],
@@ -40,7 +40,7 @@ IDLE = [
 BUSY = [
     ["checkpoint=small-ours", "precision=bf16"],
     ["stepper=network", "kernels=torch"],
-    ["video=none", "thin_body=8"],
+    ["video=none", "picture={thin_body:8}"],
     ["video=none", "sheet=false", "colour=rg"],  # it is stored as well
     ["cloth_contact={friction:0.5}"],
 ]

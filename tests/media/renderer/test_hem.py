@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hood.media.pieces import between_hems
 from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import FAR, RenderMesh, hem_distance, render_frame, sewn
 from hood.testing import cylinder, sphere
@@ -58,3 +59,19 @@ def test_cloth_beside_a_sharp_fold_is_drawn_as_without_it() -> None:
     front = RenderMesh(folded, faces[(x[faces] < 0.21).all(axis=1)])
     pictures = [render_frame([mesh], camera, 80, 80, floor=-1.0).astype(int) for mesh in (front, RenderMesh(folded, faces))]
     assert np.abs(pictures[0] - pictures[1]).max() < 25
+
+
+def test_no_wedge_is_drawn_where_a_face_lies_between_hems() -> None:
+    """A corner of a square, cut off by an edge from hem to hem: all its corners are at the hem, its middle is not."""
+    pos = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, 0.4, 0.0], [0.4, 0.4, 0.0]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    assert between_hems(faces).tolist() == [0, 1]
+    tube, tube_faces = cylinder(12, 4, radius=0.2, height=0.6)
+    assert len(between_hems(tube_faces)) == 0
+    camera = Camera((0.2, 0.2, 1.0), (0.2, 0.2, 0.0))
+    bare, wedge, mended = (
+        render_frame([RenderMesh(pos, faces, hem=hem, unsewn=unsewn)], camera, 60, 60, floor=-1.0).astype(int)
+        for hem, unsewn in ((None, None), (hem_distance(pos, faces), None), (hem_distance(pos, faces), between_hems(faces)))
+    )
+    assert np.abs(bare - wedge).max() > 20
+    assert np.abs(bare - mended).max() <= 1
