@@ -7,6 +7,7 @@ a step that needs body edges alone is spared the triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -129,26 +130,45 @@ def moving_contacts(
     Their closest points stay on the faces, edges and vertices of the body that they were found on. The values are those of the
     searches, to rounding.
     """
-    near = _moving(contact, pos, obstacle)
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    normals = (
+        geometry.normals_of_fans(at, obstacle.faces, incidence.around, incidence.first)
+        for at in (obstacle.pos, obstacle.next_pos)
+    )
+    skin = _Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+    near = _moving(contact, pos, obstacle, skin)
     dist = torch.copysign((pos - near.point).norm(dim=1), contact.dist)
     first = replace(near, dist=torch.where(contact.valid & (contact.dist != 0), dist, contact.dist))
     if second is None or second.contact is None:
         return first, second
-    other = _moving(second.contact, _ahead(pos, first), obstacle)
+    other = _moving(second.contact, _ahead(pos, first), obstacle, skin)
     dist = ((pos - other.point) * other.normal).sum(dim=1)
     return first, SecondContact(replace(other, dist=torch.where(other.valid, dist, other.dist)))
 
 
-def _moving(contact: Contact, at: Tensor, obstacle: Obstacle) -> Contact:
+class _Skin(NamedTuple):
+    """The body at its vertices: unit normals (W, 3) at t and t + 1, curvatures (W,) [1/m] at t."""
+
+    normal: Tensor
+    next_normal: Tensor
+    curvature: Tensor
+
+
+def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: _Skin) -> Contact:
     """A contact whose closest points follow the positions ``at`` (V, 3) and the body."""
     face = torch.where(contact.valid, contact.face, 0)
-    bary = torch.where(contact.valid.unsqueeze(1), _weights(at, obstacle.pos[obstacle.faces[face]], contact.bary), 1.0 / 3.0)
-    hit = SurfaceHit(contact.vertex, contact.vertex_dist, face, bary, contact.dist)
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    match, row = _match_of(hit, obstacle, incidence), contact.valid.unsqueeze(1)
-    names = ("bary", "point", "normal", "next_point", "next_normal")
-    moved = {name: torch.where(row, getattr(match, name), getattr(contact, name)) for name in names}
-    curvature = torch.where(contact.valid, _matched_curvature(match, obstacle, incidence), contact.curvature)
+    corners = obstacle.faces[face]
+    bary = torch.where(contact.valid.unsqueeze(1), _weights(at, obstacle.pos[corners], contact.bary), 1.0 / 3.0)
+    found = {
+        "bary": bary,
+        "point": _weigh(bary, obstacle.pos[corners]),
+        "next_point": _weigh(bary, obstacle.next_pos[corners]),
+        "normal": _mean_normal(skin.normal, corners, bary),
+        "next_normal": _mean_normal(skin.next_normal, corners, bary),
+    }
+    row = contact.valid.unsqueeze(1)
+    moved = {name: torch.where(row, values, getattr(contact, name)) for name, values in found.items()}
+    curvature = torch.where(contact.valid, (bary * skin.curvature[corners]).sum(dim=1), contact.curvature)
     return replace(contact, curvature=curvature, **moved)
 
 
@@ -343,6 +363,9 @@ def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
 
 def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor, incidence: Incidence) -> Tensor:
     """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
-    at_vertices = geometry.normals_of_fans(pos, faces, incidence.around, incidence.first)
+    return _mean_normal(geometry.normals_of_fans(pos, faces, incidence.around, incidence.first), corners, bary)
+
+
+def _mean_normal(at_vertices: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
     normal = _weigh(bary, at_vertices.index_select(0, corners.reshape(-1)).view(-1, 3, 3))
-    return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)
+    return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(normal.dtype).tiny)

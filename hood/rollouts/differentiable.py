@@ -30,20 +30,17 @@ from hood.cloth.state import State, StepInput
 from hood.contact.contact import moving_contacts
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
+from hood.rollouts.adjoint import Preconditioner, force
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import fixed_positions
-from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
-from hood.solver.system.plan import plan_for, quadratic_model
 from hood.steppers.newton import NewtonStepper, as_taken
 from hood.tensors.batch import made_of, to_device
 
 _T = TypeVar("_T")
 
-#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian; each is
-#: preconditioned by a system with the solver's matrix, solved to the second number.
-_TOLERANCE, _INNER = 1e-10, 1e-3
-_MOST_PRODUCTS, _MOST_INNER = 200, 4000
+#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian.
+_TOLERANCE, _MOST_PRODUCTS = 1e-10, 200
 
 
 def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
@@ -163,38 +160,23 @@ class _Solved:
         problem = _with_contacts(potential, _swapped(self.problem, table), self.taken)
         pos, free = self.pos.detach().requires_grad_(), problem.cloth.free.unsqueeze(1)
         fixed = fixed_positions(problem)
-        energy = potential.total(problem, torch.where(free, pos, fixed)).sum()
-        (force,) = torch.autograd.grad(energy, pos, create_graph=True)
+        pull = force(potential, problem, torch.where(free, pos, fixed), self.taken)
 
         def hessian(x: Tensor) -> Tensor:
-            (there,) = torch.autograd.grad(force, pos, x, retain_graph=True)
+            (there,) = torch.autograd.grad(pull, pos, x, retain_graph=True)
             return there
 
         adjoint = self._solve(hessian, torch.where(free, grad, 0.0))
-        value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * force).sum()
+        value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * pull).sum()
         if not value.requires_grad:
             return tuple(None for _ in leaves)
         return torch.autograd.grad(value, leaves, allow_unused=True)
 
     def _solve(self, hessian: Callable[[Tensor], Tensor], rhs: Tensor) -> Tensor:
-        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with the solver's matrix
-        as preconditioner."""
+        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with nearly the same matrix as
+        preconditioner."""
         with torch.no_grad():
-            problem, plan = self.taken, plan_for(self.taken)
-            model = quadratic_model(self._plain, problem, plan, self.pos, problem.acceleration(self.pos))
-        parts = model.triples + model.indefinite_part, model.triples
-        exact, positive = (beside(product(plan.pattern, triples), model.layers) for triples in parts)
-        inverse = by_blocks(diagonal_inverse(plan.pattern, model.triples))
-        tolerance = torch.full((problem.num_scenes,), _INNER, dtype=rhs.dtype)
-
-        def precondition(r: Tensor) -> Tensor:
-            for apply in (exact, positive):
-                near = r[plan.vertices], plan.scene, problem.num_scenes, tolerance, _MOST_INNER
-                found, _, indefinite = conjugate_gradients(apply, inverse, *near)
-                if not bool(indefinite.any()):
-                    break
-            return torch.zeros_like(r).index_copy(0, plan.vertices, found)
-
+            precondition = Preconditioner(self._plain, self.taken, self.pos)
         found, met = _flexible(hessian, precondition, rhs)
         if not met:
             warnings.warn(
@@ -254,8 +236,7 @@ def _with_contacts(potential: Potential, problem: StepProblem, taken: StepProble
     pos = problem.state.pos
     # Apart from the positions at t that the energies themselves know.
     at = pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
-    (slope,) = torch.autograd.grad(internal.total(problem, at).sum(), at, create_graph=True)
-    return replace(problem, internal_force=-slope)
+    return replace(problem, internal_force=-force(internal, problem, at, taken))
 
 
 def _detached(cloth: Cloth, plain: Mapping[int, Tensor]) -> Cloth:
