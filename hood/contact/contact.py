@@ -130,12 +130,7 @@ def moving_contacts(
     Their closest points stay on the faces, edges and vertices of the body that they were found on. The values are those of the
     searches, to rounding.
     """
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    normals = (
-        geometry.normals_of_fans(at, obstacle.faces, incidence.around, incidence.first)
-        for at in (obstacle.pos, obstacle.next_pos)
-    )
-    skin = _Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+    skin = _skin(obstacle)
     near = _moving(contact, pos, obstacle, skin)
     dist = torch.copysign((pos - near.point).norm(dim=1), contact.dist)
     first = replace(near, dist=torch.where(contact.valid & (contact.dist != 0), dist, contact.dist))
@@ -152,6 +147,18 @@ class _Skin(NamedTuple):
     normal: Tensor
     next_normal: Tensor
     curvature: Tensor
+
+
+def _skin(obstacle: Obstacle) -> _Skin:
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    both = obstacle.pos, obstacle.next_pos
+    if not any(pos.requires_grad for pos in both):
+        given = obstacle.faces, incidence.adjacency
+        now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
+        if now is not None and later is not None:
+            return _Skin(now[0], later[0], now[1])
+    normals = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
+    return _Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 
 
 def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: _Skin) -> Contact:

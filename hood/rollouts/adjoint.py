@@ -40,13 +40,10 @@ def force(potential: Potential, problem: StepProblem, pos: Tensor, taken: StepPr
     Args:
         taken: the same problem with numbers alone, of one cloth at all steps: tables are kept by it.
     """
-    total, rest = torch.zeros_like(pos), potential
-    if compiled_elements.applies(pos.detach()):
-        own = {name: term for name, term in potential.terms.items() if type(term) in (Stretching, Bending)}
-        rest = potential.only({name: term for name, term in potential.terms.items() if name not in own})
-        for term in own.values():
-            if term.applies(problem):
-                total = total + (_membrane if type(term) is Stretching else _bending)(problem, pos, taken)
+    total = torch.zeros_like(pos)
+    own, rest = _written_out(potential, problem)
+    for kind in own:
+        total = total + (_membrane if kind is Stretching else _bending)(problem, pos, taken)
     single, rest = split(rest)
     if single.terms:
         total = total + _on_vertices(vertex_forces(single, problem), pos, problem.acceleration(pos))
@@ -54,6 +51,42 @@ def force(potential: Potential, problem: StepProblem, pos: Tensor, taken: StepPr
         (slope,) = torch.autograd.grad(rest.total(problem, pos).sum(), pos, create_graph=True)
         total = total + slope
     return total
+
+
+def _written_out(potential: Potential, problem: StepProblem) -> tuple[list[type], Potential]:
+    """The kinds of energies of elements that the compiled pass knows by heart, and the other terms."""
+    if not compiled_elements.applies(problem.state.pos.detach()):
+        return [], potential
+    own = {name: term for name, term in potential.terms.items() if type(term) in (Stretching, Bending)}
+    kinds = [type(term) for term in own.values() if term.applies(problem)]
+    return kinds, potential.only({name: term for name, term in potential.terms.items() if name not in own})
+
+
+class Hessian:
+    """x (V, 3) → H x of a step at its minimum ``pos`` (V, 3), at free vertices, zero elsewhere; of numbers alone."""
+
+    def __init__(self, potential: Potential, taken: StepProblem, pos: Tensor) -> None:
+        self._taken, self._free = taken, taken.cloth.free.unsqueeze(1)
+        self._own, rest = _written_out(potential, taken)
+        single, rest = split(rest)
+        acc = taken.acceleration(pos)
+        with torch.no_grad():
+            model = vertex_forces(single, taken, compiled=True).model(pos, acc)
+            self._blocks = model.matrix if model.indefinite_part is None else model.matrix + model.indefinite_part
+        self._pos, self._rest, self._at = compiled_elements.as_double(pos), None, pos.detach()
+        if rest.active(taken):
+            with torch.enable_grad():
+                self._at = pos.detach().requires_grad_()
+                (self._rest,) = torch.autograd.grad(rest.total(taken, self._at).sum(), self._at, create_graph=True)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        direction, total = compiled_elements.as_double(x), torch.bmm(self._blocks, x.unsqueeze(2)).squeeze(2)
+        for kind in self._own:
+            along = compiled_elements.along_membrane if kind is Stretching else compiled_elements.along_bending
+            along(self._taken.cloth, self._pos, direction, total.numpy())
+        if self._rest is not None and self._rest.requires_grad:
+            total = total + torch.autograd.grad(self._rest, self._at, x, retain_graph=True)[0]
+        return torch.where(self._free, total, 0.0)
 
 
 def _on_vertices(forces: VertexForces, pos: Tensor, acc: Tensor) -> Tensor:
@@ -99,7 +132,9 @@ class _Membrane(torch.autograd.Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, direction: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         along = np.zeros_like(ctx.pos)
-        by = torch.from_numpy(compiled_elements.along_membrane(ctx.cloth, ctx.pos, compiled_elements.as_double(direction), along))
+        by = torch.from_numpy(
+            compiled_elements.along_membrane(ctx.cloth, ctx.pos, compiled_elements.as_double(direction), along)
+        )
         return None, torch.from_numpy(along), by[0], by[1 : 1 + ctx.rows], by[5:].t().reshape(-1, 2, 2)
 
 
@@ -114,7 +149,9 @@ class _Bending(torch.autograd.Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, direction: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         along = np.zeros_like(ctx.pos)
-        by = torch.from_numpy(compiled_elements.along_bending(ctx.cloth, ctx.pos, compiled_elements.as_double(direction), along))
+        by = torch.from_numpy(
+            compiled_elements.along_bending(ctx.cloth, ctx.pos, compiled_elements.as_double(direction), along)
+        )
         return None, torch.from_numpy(along), by[0], by[1]
 
 

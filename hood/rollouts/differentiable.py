@@ -30,7 +30,7 @@ from hood.cloth.state import State, StepInput
 from hood.contact.contact import moving_contacts
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.rollouts.adjoint import Preconditioner, force
+from hood.rollouts.adjoint import Hessian, Preconditioner, force
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import fixed_positions
@@ -40,7 +40,7 @@ from hood.tensors.batch import made_of, to_device
 _T = TypeVar("_T")
 
 #: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian.
-_TOLERANCE, _MOST_PRODUCTS = 1e-10, 200
+_TOLERANCE, _MOST_PRODUCTS = 1e-9, 200
 
 
 def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
@@ -162,22 +162,18 @@ class _Solved:
         fixed = fixed_positions(problem)
         pull = force(potential, problem, torch.where(free, pos, fixed), self.taken)
 
-        def hessian(x: Tensor) -> Tensor:
-            (there,) = torch.autograd.grad(pull, pos, x, retain_graph=True)
-            return there
-
-        adjoint = self._solve(hessian, torch.where(free, grad, 0.0))
+        adjoint = self._solve(torch.where(free, grad, 0.0))
         value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * pull).sum()
         if not value.requires_grad:
             return tuple(None for _ in leaves)
         return torch.autograd.grad(value, leaves, allow_unused=True)
 
-    def _solve(self, hessian: Callable[[Tensor], Tensor], rhs: Tensor) -> Tensor:
+    def _solve(self, rhs: Tensor) -> Tensor:
         """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with nearly the same matrix as
         preconditioner."""
         with torch.no_grad():
-            precondition = Preconditioner(self._plain, self.taken, self.pos)
-        found, met = _flexible(hessian, precondition, rhs)
+            at = self._plain, self.taken, self.pos
+            found, met = _flexible(Hessian(*at), Preconditioner(*at), rhs)
         if not met:
             warnings.warn(
                 "differentiable step: the adjoint system was not solved to 1e-7: the step has not ended at a minimum, or a "
