@@ -74,6 +74,10 @@ class Contact:
 _RULE = FoldRule(ahead=15e-3, near=20e-3, cosine=0.3, behind=1e-3)
 
 
+#: Off the skin by this [m].
+AHEAD = _RULE.ahead
+
+
 @dataclass(frozen=True)
 class SecondContact:
     """The other side of folds of the body: of vertices between two parts of the skin that face each other, as in the bend of an
@@ -130,7 +134,7 @@ def moving_contacts(
     Their closest points stay on the faces, edges and vertices of the body that they were found on. The values are those of the
     searches, to rounding.
     """
-    skin = _skin(obstacle)
+    skin = skin_of(obstacle)
     near = _moving(contact, pos, obstacle, skin)
     dist = torch.copysign((pos - near.point).norm(dim=1), contact.dist)
     first = replace(near, dist=torch.where(contact.valid & (contact.dist != 0), dist, contact.dist))
@@ -141,7 +145,7 @@ def moving_contacts(
     return first, SecondContact(replace(other, dist=torch.where(other.valid, dist, other.dist)))
 
 
-class _Skin(NamedTuple):
+class Skin(NamedTuple):
     """The body at its vertices: unit normals (W, 3) at t and t + 1, curvatures (W,) [1/m] at t."""
 
     normal: Tensor
@@ -149,19 +153,20 @@ class _Skin(NamedTuple):
     curvature: Tensor
 
 
-def _skin(obstacle: Obstacle) -> _Skin:
+def skin_of(obstacle: Obstacle) -> Skin:
+    """The body at its vertices, which autograd follows where it moves them."""
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))
     both = obstacle.pos, obstacle.next_pos
     if not any(pos.requires_grad for pos in both):
         given = obstacle.faces, incidence.adjacency
         now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
         if now is not None and later is not None:
-            return _Skin(now[0], later[0], now[1])
+            return Skin(now[0], later[0], now[1])
     normals = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
-    return _Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+    return Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 
 
-def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: _Skin) -> Contact:
+def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: Skin) -> Contact:
     """A contact whose closest points follow the positions ``at`` (V, 3) and the body."""
     face = torch.where(contact.valid, contact.face, 0)
     corners = obstacle.faces[face]
@@ -179,9 +184,13 @@ def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: _Skin) -> Co
     return replace(contact, curvature=curvature, **moved)
 
 
+#: Weights that differ by more belong to another place.
+_SAME = 1e-6
+
+
 def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
     """Weights (N, 3) of the points of triangles ``corners`` (N, 3, 3) nearest to ``at`` (N, 3), on the face, the edge or at the
-    corner that the ``known`` weights (N, 3) are on."""
+    corner that the ``known`` weights (N, 3) are on; those themselves where they were found for another place."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], at - corners[:, 0]
     a, b, c = (first * first).sum(1), (first * second).sum(1), (second * second).sum(1)
     p, q = (first * offset).sum(1), (second * offset).sum(1)
@@ -198,7 +207,8 @@ def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
         column = [torch.zeros_like(share)] * 3
         column[start], column[end] = 1.0 - share, share
         found = torch.where(on.unsqueeze(1), torch.stack(column, dim=1), found)
-    return found
+    same = ((found.detach() - known).abs() < _SAME).all(dim=1, keepdim=True)
+    return torch.where(same, found, known)
 
 
 def find_static_second_contact(

@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "element_laws.h"
+#include "followed_contact.h"
 #include "vector.h"
 #include "vertex_terms.h"
 
@@ -281,6 +282,21 @@ void elements_grip(const Contact* all, const Reach* reach, double weight, double
             normal[3 * v + k] = force[v] > 0.0 ? up[k] : 0.0;
             anchor[3 * v + k] = pos[k] + (force[v] > 0.0 ? goal[k] - all->point[3 * v + k] : 0.0);
         }
+    }
+}
+
+// Adds how the force of a term on the body, along a direction (V, 3), changes with what is followed, to (V, 16): positions at t,
+// velocities, forces of the cloth around, mass, factor of friction, mean square of the edges, their growth, and what it is.
+void elements_followed(const Followed* all, const FollowedTerm* term, const double* direction, double* by) {
+    for (int64_t v = 0; v < all->count; ++v) {
+        const double* way = direction + 3 * v;
+        if (!(all->mass[v] > 0.0) || (way[0] == 0.0 && way[1] == 0.0 && way[2] == 0.0)) continue;
+        bool acts = false;
+        const double work = work_at<double>(*all, *term, v, way, &acts);
+        if (!acts) continue;  // most vertices touch nothing
+        const Dual followed = work_at<Dual>(*all, *term, v, way, &acts);
+        for (int k = 0; k < 13; ++k) by[SLOPES * v + k] += followed.d[k];
+        by[SLOPES * v + 13] += work;
     }
 }
 

@@ -27,10 +27,9 @@ from torch.autograd.function import once_differentiable
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
-from hood.contact.contact import moving_contacts
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.rollouts.adjoint import Hessian, Preconditioner, force
+from hood.rollouts.adjoint import Hessian, Preconditioner, apart, slopes_along
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import fixed_positions
@@ -156,23 +155,25 @@ class _Solved:
         originals = _given(self.problem, self.potential)
         leaves = [tensor.detach().requires_grad_() for tensor in originals]
         table = dict(zip(self.ids, leaves, strict=True))
-        potential = _with_tensors(self.potential, table)
-        problem = _with_contacts(potential, _swapped(self.problem, table), self.taken)
-        pos, free = self.pos.detach().requires_grad_(), problem.cloth.free.unsqueeze(1)
+        potential = apart(_with_tensors(self.potential, table), self.taken, self.pos)
+        problem, free = _swapped(self.problem, table), self.taken.cloth.free.unsqueeze(1)
+        adjoint = self._solve(
+            torch.where(free, grad, 0.0), self._plain.only({name: self._plain.terms[name] for name in potential.terms})
+        )
+        slopes = [(of, -by) for of, by in slopes_along(potential, problem, self.taken, self.pos, adjoint) if of.requires_grad]
         fixed = fixed_positions(problem)
-        pull = force(potential, problem, torch.where(free, pos, fixed), self.taken)
-
-        adjoint = self._solve(torch.where(free, grad, 0.0))
-        value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * pull).sum()
-        if not value.requires_grad:
+        if fixed.requires_grad:
+            slopes.append((fixed, torch.where(free, 0.0, grad)))
+        if not slopes:
             return tuple(None for _ in leaves)
-        return torch.autograd.grad(value, leaves, allow_unused=True)
+        of, by = zip(*slopes, strict=True)
+        return torch.autograd.grad(of, leaves, by, allow_unused=True)
 
-    def _solve(self, rhs: Tensor) -> Tensor:
+    def _solve(self, rhs: Tensor, potential: Potential) -> Tensor:
         """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with nearly the same matrix as
         preconditioner."""
         with torch.no_grad():
-            at = self._plain, self.taken, self.pos
+            at = potential, self.taken, self.pos
             found, met = _flexible(Hessian(*at), Preconditioner(*at), rhs)
         if not met:
             warnings.warn(
@@ -218,21 +219,6 @@ def _flexible(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor]
         length = (p * r).sum() / curvature
         x, r = x + length * p, r - length * q
     return x, not bool(r.norm() > 1e3 * limit)
-
-
-def _with_contacts(potential: Potential, problem: StepProblem, taken: StepProblem) -> StepProblem:
-    """The problem with the contacts that its step was taken with, following body and cloth."""
-    obstacle, problem = problem.step.obstacle, replace(problem, layers=taken.layers)
-    if obstacle is not None and taken.contact is not None:
-        contact, second = moving_contacts(taken.contact, taken.second_contact, problem.state.pos, obstacle)
-        problem = replace(problem, contact=contact, second_contact=second)
-    internal = potential.asked_internal(problem)
-    if internal is None:
-        return problem
-    pos = problem.state.pos
-    # Apart from the positions at t that the energies themselves know.
-    at = pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
-    return replace(problem, internal_force=-force(internal, problem, at, taken))
 
 
 def _detached(cloth: Cloth, plain: Mapping[int, Tensor]) -> Cloth:
