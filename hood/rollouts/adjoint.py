@@ -26,7 +26,8 @@ from hood.energies.mass_points import Gravity, Inertia
 from hood.energies.membrane import Stretching, weave_roots
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, dot_rows
-from hood.energies.term import Energy, Form, Role, form_of
+from hood.energies.self_contact import has_layers
+from hood.energies.term import Energy, Role
 from hood.native.build import BuildError
 from hood.solver.compiled import newton
 from hood.solver.compiled.system import CompiledSystem
@@ -44,11 +45,13 @@ _EXACT, _NEAR, _MOST_ITERATIONS = 1e-5, 1e-3, 4000
 Slope = tuple[Tensor, Tensor]
 
 
-def apart(potential: Potential, taken: StepProblem, pos: Tensor) -> Potential:
-    """The potential without the barrier between layers where none is near another at ``pos`` (V, 3): it has no derivatives."""
-    if any(len(scene.layers.contacts(scene.of(pos)).corners) for scene in taken.layers):
-        return potential
-    return potential.only({name: term for name, term in potential.terms.items() if form_of(term) is not Form.LAYERS})
+def meets(taken: StepProblem, pos: Tensor) -> bool:
+    """Whether any cloth is near cloth where a step begins or at its end ``pos`` (V, 3): else layers have no derivatives."""
+    near = (
+        len(scene.near_at_start(taken.state.pos).corners) or len(scene.layers.contacts(scene.of(pos)).corners)
+        for scene in taken.layers
+    )
+    return any(near)
 
 
 def slopes_along(potential: Potential, problem: StepProblem, taken: StepProblem, pos: Tensor, way: Tensor) -> Iterator[Slope]:
@@ -256,7 +259,7 @@ class Preconditioner:
 
     def __init__(self, potential: Potential, taken: StepProblem, pos: Tensor) -> None:
         self._problem, self._plan = taken, plan_for(taken)
-        if _has_barrier(potential):  # cloth near cloth lies as it does at the minimum
+        if has_layers(potential):  # cloth near cloth lies as it does at the minimum
             self._problem = taken.with_ways_from(pos)
         self._exact = True
         self._system = _compiled(potential, self._problem, self._plan, pos)
@@ -294,10 +297,6 @@ class Preconditioner:
             if not bool(indefinite.any()):
                 break
         return torch.zeros_like(r).index_copy(0, plan.vertices, found)
-
-
-def _has_barrier(potential: Potential) -> bool:
-    return any(form_of(term) is Form.LAYERS for term in potential.terms.values())
 
 
 def _compiled(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor) -> CompiledSystem | None:

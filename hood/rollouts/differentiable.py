@@ -29,7 +29,8 @@ from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.rollouts.adjoint import Hessian, Preconditioner, apart, slopes_along
+from hood.energies.self_contact import without_layers
+from hood.rollouts.adjoint import Hessian, Preconditioner, meets, slopes_along
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import fixed_positions
@@ -45,31 +46,32 @@ _TOLERANCE, _MOST_PRODUCTS = 1e-9, 200
 def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
     """The state at t + 1: the solver's, differentiable by every tensor of ``problem`` that requires a gradient.
 
-    Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
-    and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
-    tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
-    the minimum nearby.
+        Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
+        and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
+        tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
+        the minimum nearby.
 
-    Raises:
-        ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
+        Raises:
+            ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
 
-    Examples:
-        >>> import numpy as np, torch, hood
-        >>> from hood.cloth.cloth import build_cloth, with_values
-        >>> from hood.cloth.state import State, StepInput
-        >>> from hood.energies.problem import StepProblem
-        >>> from hood.steppers.newton import NewtonStepper
-        >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
-        >>> held = np.array([True, True, False, False])
-        >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
-        >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
-        >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
-        >>> state = State(torch.as_tensor(pos), still, origin)
-        >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
-        >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
-        >>> after.pos[3, 1].backward()
-        >>> bool(mu.grad > 0)  # harder cloth hangs higher
-        True
+        Examples:
+            >>> import numpy as np, torch, hood
+            >>> from hood.cloth.cloth import build_cloth, with_values
+            >>> from hood.cloth.state import State, StepInput
+            >>> from hood.energies.problem import StepProblem
+    from hood.energies.self_contact import without_layers
+            >>> from hood.steppers.newton import NewtonStepper
+            >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
+            >>> held = np.array([True, True, False, False])
+            >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+            >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
+            >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
+            >>> state = State(torch.as_tensor(pos), still, origin)
+            >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
+            >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
+            >>> after.pos[3, 1].backward()
+            >>> bool(mu.grad > 0)  # harder cloth hangs higher
+            True
     """
     given = _given(problem, stepper.potential)
     wrong = next((tensor for tensor in given if tensor.dtype != torch.float64), None)
@@ -135,6 +137,9 @@ class _Solved:
             prediction = own.predict(fixed, None)
             self.taken = as_taken(fixed, prediction)
             self.pos, self.vel = prediction.next_pos, own.next_velocity(fixed, prediction)
+        self._apart = not meets(self.taken, self.pos)
+        if self._apart:  # what is known of layers is large
+            self._plain, self.taken = without_layers(self._plain), replace(self.taken, layers=())
         self._check()
 
     def _check(self) -> None:
@@ -155,11 +160,9 @@ class _Solved:
         originals = _given(self.problem, self.potential)
         leaves = [tensor.detach().requires_grad_() for tensor in originals]
         table = dict(zip(self.ids, leaves, strict=True))
-        potential = apart(_with_tensors(self.potential, table), self.taken, self.pos)
+        potential = _with_tensors(without_layers(self.potential) if self._apart else self.potential, table)
         problem, free = _swapped(self.problem, table), self.taken.cloth.free.unsqueeze(1)
-        adjoint = self._solve(
-            torch.where(free, grad, 0.0), self._plain.only({name: self._plain.terms[name] for name in potential.terms})
-        )
+        adjoint = self._solve(torch.where(free, grad, 0.0))
         slopes = [(of, -by) for of, by in slopes_along(potential, problem, self.taken, self.pos, adjoint) if of.requires_grad]
         fixed = fixed_positions(problem)
         if fixed.requires_grad:
@@ -169,11 +172,11 @@ class _Solved:
         of, by = zip(*slopes, strict=True)
         return torch.autograd.grad(of, leaves, by, allow_unused=True)
 
-    def _solve(self, rhs: Tensor, potential: Potential) -> Tensor:
+    def _solve(self, rhs: Tensor) -> Tensor:
         """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with nearly the same matrix as
         preconditioner."""
         with torch.no_grad():
-            at = potential, self.taken, self.pos
+            at = self._plain, self.taken, self.pos
             found, met = _flexible(Hessian(*at), Preconditioner(*at), rhs)
         if not met:
             warnings.warn(
@@ -218,7 +221,7 @@ def _flexible(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor]
             return x, False
         length = (p * r).sum() / curvature
         x, r = x + length * p, r - length * q
-    return x, not bool(r.norm() > 1e3 * limit)
+    return x, not bool(r.norm() > 1e2 * limit)
 
 
 def _detached(cloth: Cloth, plain: Mapping[int, Tensor]) -> Cloth:
