@@ -7,6 +7,7 @@ a step that needs body edges alone is spared the triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -73,6 +74,10 @@ class Contact:
 _RULE = FoldRule(ahead=15e-3, near=20e-3, cosine=0.3, behind=1e-3)
 
 
+#: Off the skin by this [m].
+AHEAD = _RULE.ahead
+
+
 @dataclass(frozen=True)
 class SecondContact:
     """The other side of folds of the body: of vertices between two parts of the skin that face each other, as in the bend of an
@@ -129,32 +134,63 @@ def moving_contacts(
     Their closest points stay on the faces, edges and vertices of the body that they were found on. The values are those of the
     searches, to rounding.
     """
-    near = _moving(contact, pos, obstacle)
+    skin = skin_of(obstacle)
+    near = _moving(contact, pos, obstacle, skin)
     dist = torch.copysign((pos - near.point).norm(dim=1), contact.dist)
     first = replace(near, dist=torch.where(contact.valid & (contact.dist != 0), dist, contact.dist))
     if second is None or second.contact is None:
         return first, second
-    other = _moving(second.contact, _ahead(pos, first), obstacle)
+    other = _moving(second.contact, _ahead(pos, first), obstacle, skin)
     dist = ((pos - other.point) * other.normal).sum(dim=1)
     return first, SecondContact(replace(other, dist=torch.where(other.valid, dist, other.dist)))
 
 
-def _moving(contact: Contact, at: Tensor, obstacle: Obstacle) -> Contact:
+class Skin(NamedTuple):
+    """The body at its vertices: unit normals (W, 3) at t and t + 1, curvatures (W,) [1/m] at t."""
+
+    normal: Tensor
+    next_normal: Tensor
+    curvature: Tensor
+
+
+def skin_of(obstacle: Obstacle) -> Skin:
+    """The body at its vertices, which autograd follows where it moves them."""
+    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
+    both = obstacle.pos, obstacle.next_pos
+    if not any(pos.requires_grad for pos in both):
+        given = obstacle.faces, incidence.adjacency
+        now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
+        if now is not None and later is not None:
+            return Skin(now[0], later[0], now[1])
+    normals = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
+    return Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+
+
+def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: Skin) -> Contact:
     """A contact whose closest points follow the positions ``at`` (V, 3) and the body."""
     face = torch.where(contact.valid, contact.face, 0)
-    bary = torch.where(contact.valid.unsqueeze(1), _weights(at, obstacle.pos[obstacle.faces[face]], contact.bary), 1.0 / 3.0)
-    hit = SurfaceHit(contact.vertex, contact.vertex_dist, face, bary, contact.dist)
-    incidence = build_incidence(obstacle.faces, len(obstacle.pos))
-    match, row = _match_of(hit, obstacle, incidence), contact.valid.unsqueeze(1)
-    names = ("bary", "point", "normal", "next_point", "next_normal")
-    moved = {name: torch.where(row, getattr(match, name), getattr(contact, name)) for name in names}
-    curvature = torch.where(contact.valid, _matched_curvature(match, obstacle, incidence), contact.curvature)
+    corners = obstacle.faces[face]
+    bary = torch.where(contact.valid.unsqueeze(1), _weights(at, obstacle.pos[corners], contact.bary), 1.0 / 3.0)
+    found = {
+        "bary": bary,
+        "point": _weigh(bary, obstacle.pos[corners]),
+        "next_point": _weigh(bary, obstacle.next_pos[corners]),
+        "normal": _mean_normal(skin.normal, corners, bary),
+        "next_normal": _mean_normal(skin.next_normal, corners, bary),
+    }
+    row = contact.valid.unsqueeze(1)
+    moved = {name: torch.where(row, values, getattr(contact, name)) for name, values in found.items()}
+    curvature = torch.where(contact.valid, (bary * skin.curvature[corners]).sum(dim=1), contact.curvature)
     return replace(contact, curvature=curvature, **moved)
+
+
+#: Weights that differ by more belong to another place.
+_SAME = 1e-6
 
 
 def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
     """Weights (N, 3) of the points of triangles ``corners`` (N, 3, 3) nearest to ``at`` (N, 3), on the face, the edge or at the
-    corner that the ``known`` weights (N, 3) are on."""
+    corner that the ``known`` weights (N, 3) are on; those themselves where they were found for another place."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], at - corners[:, 0]
     a, b, c = (first * first).sum(1), (first * second).sum(1), (second * second).sum(1)
     p, q = (first * offset).sum(1), (second * offset).sum(1)
@@ -171,7 +207,8 @@ def _weights(at: Tensor, corners: Tensor, known: Tensor) -> Tensor:
         column = [torch.zeros_like(share)] * 3
         column[start], column[end] = 1.0 - share, share
         found = torch.where(on.unsqueeze(1), torch.stack(column, dim=1), found)
-    return found
+    same = ((found.detach() - known).abs() < _SAME).all(dim=1, keepdim=True)
+    return torch.where(same, found, known)
 
 
 def find_static_second_contact(
@@ -343,6 +380,9 @@ def _weigh(bary: Tensor, corner_values: Tensor) -> Tensor:
 
 def _interpolated_normal(pos: Tensor, faces: Tensor, corners: Tensor, bary: Tensor, incidence: Incidence) -> Tensor:
     """Normals vary continuously over the surface, so a sliding vertex sees no jump between facets."""
-    at_vertices = geometry.normals_of_fans(pos, faces, incidence.around, incidence.first)
+    return _mean_normal(geometry.normals_of_fans(pos, faces, incidence.around, incidence.first), corners, bary)
+
+
+def _mean_normal(at_vertices: Tensor, corners: Tensor, bary: Tensor) -> Tensor:
     normal = _weigh(bary, at_vertices.index_select(0, corners.reshape(-1)).view(-1, 3, 3))
-    return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(pos.dtype).tiny)
+    return normal / normal.norm(dim=1, keepdim=True).clamp_min(torch.finfo(normal.dtype).tiny)

@@ -209,16 +209,16 @@ _LAST: list[tuple[weakref.ref[Cloth], weakref.ref[Tensor], int, Tensor | None]] 
 
 def _known_growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
     if pos.requires_grad or pos.is_inference():
-        return _growth(cloth, pos)
+        return edge_growth(cloth, pos)
     for of, at, version, value in _LAST:
         if of() is cloth and at() is pos and version == pos._version:
             return value
-    value = _growth(cloth, pos)
+    value = edge_growth(cloth, pos)
     _LAST[:] = [(weakref.ref(cloth), weakref.ref(pos), pos._version, value)]
     return value
 
 
-def _growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
+def edge_growth(cloth: Cloth, pos: Tensor) -> Tensor | None:
     """What the square of an edge at a vertex has grown by beyond :data:`COVERED`, at most, (V,) [m²]; None where none has, on
     a CPU (elsewhere the host would wait for the answer)."""
     growth = cloth.edge_sq(pos) - COVERED * cloth.rest_edge_sq

@@ -10,7 +10,7 @@ import ctypes
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -147,6 +147,26 @@ def element_energies(
         work(table, POINTER(pos.ctypes.data), POINTER(energy.ctypes.data), into)
         energies[name] = torch.from_numpy(energy)
     return energies
+
+
+def along_membrane(cloth: Cloth, pos: np.ndarray, direction: np.ndarray, product: np.ndarray) -> np.ndarray:
+    """How the slope of the membrane's energy at ``pos`` (V, 3) along ``direction`` (V, 3) [m] changes with the numbers of every
+    face, (9, F): volume; μ and λ and two zeros, or the roots of its weave; the four of the inverse rest edges. The product of the
+    Hessian with the direction is added to ``product`` (V, 3). All float64 without gaps."""
+    faces = _constants_of(cloth).faces
+    return _along(library().elements_faces_along, faces, 9, pos, direction, product)  # type: ignore[union-attr]
+
+
+def along_bending(cloth: Cloth, pos: np.ndarray, direction: np.ndarray, product: np.ndarray) -> np.ndarray:
+    """The same of bending about the rest shape, (2, H) by the weight and the rest angle of every hinge."""
+    hinges = _constants_of(cloth).hinges
+    return _along(library().elements_hinges_along, hinges, 2, pos, direction, product)  # type: ignore[union-attr]
+
+
+def _along(work: Any, table: _Faces | _Hinges, rows: int, *vectors: np.ndarray) -> np.ndarray:
+    by = np.empty((rows, table.padded))
+    work(ctypes.byref(table), *(POINTER(array.ctypes.data) for array in (*vectors, by)))
+    return by[:, : table.count]
 
 
 def _constants_of(cloth: Cloth) -> _Constants:

@@ -94,6 +94,26 @@ inline void hinge_slopes(const Hinge& h, VN pull, VN (*slope)[3]) {
     }
 }
 
+// How the slopes of that pull change along offsets [m] of the other corners from the first, times the same ``scale``.
+inline void hinge_slopes_along(const Hinge& h, VN pull, VN scale, const VN (*slope)[3], const VN (*offset)[3], VN (*change)[3]) {
+    VN edge[3], a[3], b[3], n1[3], n2[3], part[3];
+    for (int k = 0; k < 3; ++k) edge[k] = offset[0][k] * scale, a[k] = offset[1][k] * scale, b[k] = offset[2][k] * scale;
+    cross(edge, h.a, n1), cross(h.edge, a, part);
+    for (int k = 0; k < 3; ++k) n1[k] += part[k];
+    cross(b, h.edge, n2), cross(h.b, edge, part);
+    for (int k = 0; k < 3; ++k) n2[k] += part[k];
+    const VN zero = every(0.0), longer = dot(h.edge, edge) / h.edge_sq, share_a = dot(h.edge, h.a) / h.edge_sq, share_b = dot(h.edge, h.b) / h.edge_sq;
+    const VN more_a = (dot(edge, h.a) + dot(h.edge, a)) / h.edge_sq - 2.0 * share_a * longer;
+    const VN more_b = (dot(edge, h.b) + dot(h.edge, b)) / h.edge_sq - 2.0 * share_b * longer;
+    const VN along = h.regular ? pull : zero, by_a = along / h.n1_sq, by_b = along / h.n2_sq;
+    const VN grown_a = longer - 2.0 * dot(h.n1, n1) / h.n1_sq, grown_b = longer - 2.0 * dot(h.n2, n2) / h.n2_sq;
+    for (int k = 0; k < 3; ++k) {
+        const VN at_a = grown_a * slope[2][k] + by_a * n1[k], at_b = grown_b * slope[3][k] + by_b * n2[k];
+        const VN at_end = -(more_a * slope[2][k] + share_a * at_a + more_b * slope[3][k] + share_b * at_b);
+        change[0][k] = -at_a - at_b - at_end, change[1][k] = at_end, change[2][k] = at_a, change[3][k] = at_b;
+    }
+}
+
 inline VN bend_of(VN angle, VN rest_angle) {
     const VN bend = angle - rest_angle, zero = every(0.0);
     // Both angles are within a half turn, so at most one turn is off.

@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "element_laws.h"
+#include "followed_contact.h"
 #include "vector.h"
 #include "vertex_terms.h"
 
@@ -106,6 +107,78 @@ void elements_hinges(const Hinges* hinges, const double* pos, double* energy, do
             for (int k = 0; k < 3; ++k) force[0][k] -= stretch * edge[k], force[1][k] += stretch * edge[k];
         }
         scatter<4>(force, corners, padded, count, gradient);
+    }
+}
+
+// Along a direction (V, 3) [m]: adds the product of the membrane's Hessian with it to ``hessian`` (V, 3), and writes how the slope of the
+// energy along it changes with every face's numbers, (9, F): weight; mu, lambda, 0, 0 or the roots of the weave; inverse rest edges.
+void elements_faces_along(const Faces* faces, const double* pos, const double* direction, double* hessian, double* by) {
+    const int64_t padded = faces->padded;
+    for (int64_t i = 0; i < faces->count; i += AT_ONCE) {
+        const int count = (int)std::min<int64_t>(AT_ONCE, faces->count - i);
+        const int32_t* corners = faces->corners + i;
+        VN offset[2][3], way[2][3], f[2][3], df[2][3], m[4], number[4] = {};
+        offsets_of<3, 3>(pos, corners, padded, offset);
+        offsets_of<3, 3>(direction, corners, padded, way);
+        for (int c = 0; c < 4; ++c) m[c] = load<VN>(faces->inverse + c * padded + i);
+        for (int a = 0; a < 2; ++a)
+            for (int k = 0; k < 3; ++k) {
+                f[a][k] = m[a] * offset[0][k] + m[2 + a] * offset[1][k];
+                df[a][k] = m[a] * way[0][k] + m[2 + a] * way[1][k];
+            }
+        const Strain g = green_strain(f), dg = {dot(f[0], df[0]), 0.5 * (dot(f[0], df[1]) + dot(f[1], df[0])), dot(f[1], df[1])};
+        const VN weight = load<VN>(faces->weight + i), one = every(1.0);
+        Stress s, ds;
+        if (faces->weave) {
+            const double* roots = faces->weave + i;
+            const Weave law = {load<VN>(roots), load<VN>(roots + padded), load<VN>(roots + 2 * padded), load<VN>(roots + 3 * padded)};
+            s = stress_of(law, g, one), ds = stress_of(law, dg, one);
+            const VN both = law.first * g.g00 + law.coupled * g.g11, along = law.first * dg.g00 + law.coupled * dg.g11;
+            number[0] = g.g00 * along + dg.g00 * both, number[1] = g.g11 * along + dg.g11 * both;
+            number[2] = 2.0 * law.second * g.g11 * dg.g11, number[3] = 8.0 * law.turn * g.g01 * dg.g01;
+        } else {
+            const Isotropic law = {load<VN>(faces->mu + i), load<VN>(faces->lambda + i)};
+            s = stress_of(law, g, one), ds = stress_of(law, dg, one);
+            number[0] = 2.0 * (g.g00 * dg.g00 + g.g11 * dg.g11 + 2.0 * g.g01 * dg.g01);
+            number[1] = (g.g00 + g.g11) * (dg.g00 + dg.g11);
+        }
+        store(by + i, s.s00 * dg.g00 + 2.0 * s.s01 * dg.g01 + s.s11 * dg.g11);
+        for (int c = 0; c < 4; ++c) store(by + (1 + c) * padded + i, weight * number[c]);
+        VN p[2][3], dp[2][3], force[3][3];
+        for (int k = 0; k < 3; ++k) {
+            p[0][k] = weight * (s.s00 * f[0][k] + s.s01 * f[1][k]), p[1][k] = weight * (s.s01 * f[0][k] + s.s11 * f[1][k]);
+            dp[0][k] = weight * (s.s00 * df[0][k] + s.s01 * df[1][k] + ds.s00 * f[0][k] + ds.s01 * f[1][k]);
+            dp[1][k] = weight * (s.s01 * df[0][k] + s.s11 * df[1][k] + ds.s01 * f[0][k] + ds.s11 * f[1][k]);
+            force[1][k] = m[0] * dp[0][k] + m[1] * dp[1][k], force[2][k] = m[2] * dp[0][k] + m[3] * dp[1][k];
+            force[0][k] = -(force[1][k] + force[2][k]);
+        }
+        for (int c = 0; c < 4; ++c)
+            store(by + (5 + c) * padded + i, dot(offset[c / 2], dp[c % 2]) + dot(way[c / 2], p[c % 2]));
+        scatter<3>(force, corners, padded, count, hessian);
+    }
+}
+
+// The same of bending about the rest shape; (2, H) by weight and rest angle.
+void elements_hinges_along(const Hinges* hinges, const double* pos, const double* direction, double* hessian, double* by) {
+    const int64_t padded = hinges->padded;
+    for (int64_t i = 0; i < hinges->count; i += AT_ONCE) {
+        const int count = (int)std::min<int64_t>(AT_ONCE, hinges->count - i);
+        const int32_t* corners = hinges->corners + i;
+        VN offset[3][3], way[3][3], slope[4][3], change[4][3];
+        offsets_of<4, 3>(pos, corners, padded, offset);
+        offsets_of<4, 3>(direction, corners, padded, way);
+        const VN scale = 1.0 / larger(larger(largest(offset[0]), larger(largest(offset[1]), largest(offset[2]))), every(TINY));
+        Hinge h;
+        hinge_of(offset, scale, h);
+        const VN pull = -h.length * scale, weight = load<VN>(hinges->weight + i), bend = bend_of(h.angle, load<VN>(hinges->rest_angle + i));
+        hinge_slopes(h, pull, slope);
+        hinge_slopes_along(h, pull, scale, slope, way, change);
+        const VN turned = dot(slope[1], way[0]) + dot(slope[2], way[1]) + dot(slope[3], way[2]);
+        store(by + i, bend * turned);
+        store(by + padded + i, -weight * turned);
+        for (int c = 0; c < 4; ++c)
+            for (int k = 0; k < 3; ++k) change[c][k] = weight * (turned * slope[c][k] + bend * change[c][k]);
+        scatter<4>(change, corners, padded, count, hessian);
     }
 }
 
@@ -209,6 +282,21 @@ void elements_grip(const Contact* all, const Reach* reach, double weight, double
             normal[3 * v + k] = force[v] > 0.0 ? up[k] : 0.0;
             anchor[3 * v + k] = pos[k] + (force[v] > 0.0 ? goal[k] - all->point[3 * v + k] : 0.0);
         }
+    }
+}
+
+// Adds how the force of a term on the body, along a direction (V, 3), changes with what is followed, to (V, 16): positions at t,
+// velocities, forces of the cloth around, mass, factor of friction, mean square of the edges, their growth, and what it is.
+void elements_followed(const Followed* all, const FollowedTerm* term, const double* direction, double* by) {
+    for (int64_t v = 0; v < all->count; ++v) {
+        const double* way = direction + 3 * v;
+        if (!(all->mass[v] > 0.0) || (way[0] == 0.0 && way[1] == 0.0 && way[2] == 0.0)) continue;
+        bool acts = false;
+        const double work = work_at<double>(*all, *term, v, way, &acts);
+        if (!acts) continue;  // most vertices touch nothing
+        const Dual followed = work_at<Dual>(*all, *term, v, way, &acts);
+        for (int k = 0; k < 13; ++k) by[SLOPES * v + k] += followed.d[k];
+        by[SLOPES * v + 13] += work;
     }
 }
 

@@ -1031,6 +1031,62 @@ template <class T> void direct(Engine& e, double tolerance, int64_t most) {
     e.raised = halved ? indefinite_share : raised < 0.1 ? 0.1 : raised > 1.0 ? 1.0 : raised;
 }
 
+// ---- the Hessian itself, for derivatives of the minimum --------------------------------------------------------------------
+
+// What Gauss-Newton leaves out of bending about the rest shape, force times the second derivative of the angle: blocks of the corners
+// 00 01 02 03 11 12 13 22 23 33, (H, 10, 9).
+template <class T> void hinge_curvatures(const Engine& e, T* blocks, Range range) {
+    for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
+        Hinge h;
+        VN offset[3][3], slope[4][3], change[9][4][3];
+        const VN per_unit = hinge_of(e, e.pos, i, offset, h), pull = -h.length * per_unit, weight = load<VN>(e.hinge_weight + i);
+        hinge_slopes(h, pull, slope);
+        VN force = weight * bend_of(h.angle, load<VN>(e.rest_angle + i));
+        if (e.hinge_rate) force += load<VN>(e.hinge_rate + i) * weight * bend_of(h.angle, load<VN>(e.hinge_before + i));
+        for (int d = 0; d < 9; ++d) {
+            VN way[3][3] = {};
+            way[d / 3][d % 3] = every(1.0);
+            hinge_slopes_along(h, pull, per_unit, slope, way, change[d]);
+        }
+        int place = 0;
+        for (int c = 0; c < 4; ++c)
+            for (int d = c; d < 4; ++d)
+                for (int k = 0; k < 3; ++k)
+                    for (int j = 0; j < 3; ++j, ++place) {
+                        // The first corner moves against all others.
+                        const VN one = d == 0 ? -(change[j][c][k] + change[3 + j][c][k] + change[6 + j][c][k]) : change[3 * (d - 1) + j][c][k];
+                        const VN value = force * one;
+                        for (int lane = 0; lane < AT_ONCE; ++lane) blocks[90 * (i + lane) + place] = (T)value[lane];
+                    }
+    }
+}
+
+// The matrix of the model becomes the Hessian, in the memory of those blocks; with the published code's bending it stays Gauss-Newton.
+template <class T> void make_exact(Engine& e, T* blocks) {
+    constexpr int PAIRS[4][4] = {{0, 1, 2, 3}, {1, 4, 5, 6}, {2, 5, 7, 8}, {3, 6, 8, 9}};
+    e.indefinite_share = 1.0;
+    gather_matrix<T>(e);
+    if (e.bending != 1) return;
+    T* matrix = (T*)e.matrix;
+    for_parts(e.parts, [&](int64_t part) { hinge_curvatures<T>(e, blocks, hinges_of(e, part)); });
+    for_parts(e.parts, [&](int64_t part) {
+        const Range range = rows_of(e, part);
+        for (int64_t row = range.begin; row < range.end; ++row)
+            for (int count = 4; count > 0; --count)
+                for (int64_t i = e.hinge_starts[4 * row + 4 - count]; i < e.hinge_starts[4 * row + 5 - count]; ++i) {
+                    const int32_t* use = e.hinge_uses + 5 * i;
+                    const int c = use[0] & 3;
+                    for (int b = 1; b <= count; ++b) {
+                        const int d = use[b] & 3;
+                        const T* block = blocks + 90 * (int64_t)(use[0] >> 2) + 9 * PAIRS[c][d];
+                        T* target = matrix + 9 * ((int64_t)e.row_starts[row] + (use[b] >> 2));
+                        for (int k = 0; k < 3; ++k)
+                            for (int j = 0; j < 3; ++j) target[3 * k + j] += c <= d ? block[3 * k + j] : block[3 * j + k];
+                    }
+                }
+    });
+}
+
 // ---- the line search -----------------------------------------------------------------------------------------------------
 
 // The same as below for points: how their vertices give, each along its own block.
@@ -1284,6 +1340,20 @@ double newton_model(Engine* e) {
 void newton_matrix(Engine* e, double indefinite_share) {
     e->indefinite_share = indefinite_share;
     gather_matrix<Real>(*e);
+}
+
+// The Hessian from the model, in ``memory`` for (H, 90) numbers of the matrix.
+void newton_exact(Engine* e, void* memory) { make_exact<Real>(*e, (Real*)memory); }
+
+// x (V, 3) with matrix x = ``right`` (V, 3) in the original order, of free vertices, to a tolerance; 1 where the matrix was positive
+// definite as far as was seen. Rows of other vertices are not touched; the gradient is no longer known.
+int64_t newton_solve(Engine* e, const double* right, double tolerance, int64_t most, double* x) {
+    for (int64_t row = 0; row < e->num_rows; ++row)
+        for (int k = 0; k < 3; ++k) e->gradient[4 * row + k] = -right[3 * e->vertex[row] + k];
+    const bool definite = solve<Real>(*e, tolerance, most);
+    for (int64_t row = 0; row < e->num_rows; ++row)
+        for (int k = 0; k < 3; ++k) x[3 * e->vertex[row] + k] = e->direction[4 * row + k];
+    return definite;
 }
 
 // From the model to the next state, by a linear system that is solved to a tolerance; 1 where it moved.

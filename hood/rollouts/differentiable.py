@@ -27,53 +27,51 @@ from torch.autograd.function import once_differentiable
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import State, StepInput
-from hood.contact.contact import moving_contacts
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
+from hood.energies.self_contact import without_layers
+from hood.rollouts.adjoint import Hessian, Preconditioner, meets, slopes_along
 from hood.scene.jumps import find_jumps
 from hood.scene.scene import Scene
 from hood.solver.system.iterate import fixed_positions
-from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
-from hood.solver.system.plan import plan_for, quadratic_model
 from hood.steppers.newton import NewtonStepper, as_taken
 from hood.tensors.batch import made_of, to_device
 
 _T = TypeVar("_T")
 
-#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian; each is
-#: preconditioned by a system with the solver's matrix, solved to the second number.
-_TOLERANCE, _INNER = 1e-10, 1e-3
-_MOST_PRODUCTS, _MOST_INNER = 200, 4000
+#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian.
+_TOLERANCE, _MOST_PRODUCTS = 1e-9, 200
 
 
 def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
     """The state at t + 1: the solver's, differentiable by every tensor of ``problem`` that requires a gradient.
 
-    Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
-    and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
-    tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
-    the minimum nearby.
+        Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
+        and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
+        tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
+        the minimum nearby.
 
-    Raises:
-        ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
+        Raises:
+            ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
 
-    Examples:
-        >>> import numpy as np, torch, hood
-        >>> from hood.cloth.cloth import build_cloth, with_values
-        >>> from hood.cloth.state import State, StepInput
-        >>> from hood.energies.problem import StepProblem
-        >>> from hood.steppers.newton import NewtonStepper
-        >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
-        >>> held = np.array([True, True, False, False])
-        >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
-        >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
-        >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
-        >>> state = State(torch.as_tensor(pos), still, origin)
-        >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
-        >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
-        >>> after.pos[3, 1].backward()
-        >>> bool(mu.grad > 0)  # harder cloth hangs higher
-        True
+        Examples:
+            >>> import numpy as np, torch, hood
+            >>> from hood.cloth.cloth import build_cloth, with_values
+            >>> from hood.cloth.state import State, StepInput
+            >>> from hood.energies.problem import StepProblem
+    from hood.energies.self_contact import without_layers
+            >>> from hood.steppers.newton import NewtonStepper
+            >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
+            >>> held = np.array([True, True, False, False])
+            >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+            >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
+            >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
+            >>> state = State(torch.as_tensor(pos), still, origin)
+            >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
+            >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
+            >>> after.pos[3, 1].backward()
+            >>> bool(mu.grad > 0)  # harder cloth hangs higher
+            True
     """
     given = _given(problem, stepper.potential)
     wrong = next((tensor for tensor in given if tensor.dtype != torch.float64), None)
@@ -139,6 +137,9 @@ class _Solved:
             prediction = own.predict(fixed, None)
             self.taken = as_taken(fixed, prediction)
             self.pos, self.vel = prediction.next_pos, own.next_velocity(fixed, prediction)
+        self._apart = not meets(self.taken, self.pos)
+        if self._apart:  # what is known of layers is large
+            self._plain, self.taken = without_layers(self._plain), replace(self.taken, layers=())
         self._check()
 
     def _check(self) -> None:
@@ -159,43 +160,24 @@ class _Solved:
         originals = _given(self.problem, self.potential)
         leaves = [tensor.detach().requires_grad_() for tensor in originals]
         table = dict(zip(self.ids, leaves, strict=True))
-        potential = _with_tensors(self.potential, table)
-        problem = _with_contacts(potential, _swapped(self.problem, table), self.taken)
-        pos, free = self.pos.detach().requires_grad_(), problem.cloth.free.unsqueeze(1)
+        potential = _with_tensors(without_layers(self.potential) if self._apart else self.potential, table)
+        problem, free = _swapped(self.problem, table), self.taken.cloth.free.unsqueeze(1)
+        adjoint = self._solve(torch.where(free, grad, 0.0))
+        slopes = [(of, -by) for of, by in slopes_along(potential, problem, self.taken, self.pos, adjoint) if of.requires_grad]
         fixed = fixed_positions(problem)
-        energy = potential.total(problem, torch.where(free, pos, fixed)).sum()
-        (force,) = torch.autograd.grad(energy, pos, create_graph=True)
-
-        def hessian(x: Tensor) -> Tensor:
-            (there,) = torch.autograd.grad(force, pos, x, retain_graph=True)
-            return there
-
-        adjoint = self._solve(hessian, torch.where(free, grad, 0.0))
-        value = (torch.where(free, 0.0, grad) * fixed).sum() - (adjoint * force).sum()
-        if not value.requires_grad:
+        if fixed.requires_grad:
+            slopes.append((fixed, torch.where(free, 0.0, grad)))
+        if not slopes:
             return tuple(None for _ in leaves)
-        return torch.autograd.grad(value, leaves, allow_unused=True)
+        of, by = zip(*slopes, strict=True)
+        return torch.autograd.grad(of, leaves, by, allow_unused=True)
 
-    def _solve(self, hessian: Callable[[Tensor], Tensor], rhs: Tensor) -> Tensor:
-        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with the solver's matrix
-        as preconditioner."""
+    def _solve(self, rhs: Tensor) -> Tensor:
+        """λ (V, 3) with H λ = ``rhs`` (V, 3) on free vertices, by conjugate gradients with nearly the same matrix as
+        preconditioner."""
         with torch.no_grad():
-            problem, plan = self.taken, plan_for(self.taken)
-            model = quadratic_model(self._plain, problem, plan, self.pos, problem.acceleration(self.pos))
-        parts = model.triples + model.indefinite_part, model.triples
-        exact, positive = (beside(product(plan.pattern, triples), model.layers) for triples in parts)
-        inverse = by_blocks(diagonal_inverse(plan.pattern, model.triples))
-        tolerance = torch.full((problem.num_scenes,), _INNER, dtype=rhs.dtype)
-
-        def precondition(r: Tensor) -> Tensor:
-            for apply in (exact, positive):
-                near = r[plan.vertices], plan.scene, problem.num_scenes, tolerance, _MOST_INNER
-                found, _, indefinite = conjugate_gradients(apply, inverse, *near)
-                if not bool(indefinite.any()):
-                    break
-            return torch.zeros_like(r).index_copy(0, plan.vertices, found)
-
-        found, met = _flexible(hessian, precondition, rhs)
+            at = self._plain, self.taken, self.pos
+            found, met = _flexible(Hessian(*at), Preconditioner(*at), rhs)
         if not met:
             warnings.warn(
                 "differentiable step: the adjoint system was not solved to 1e-7: the step has not ended at a minimum, or a "
@@ -239,23 +221,7 @@ def _flexible(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor]
             return x, False
         length = (p * r).sum() / curvature
         x, r = x + length * p, r - length * q
-    return x, not bool(r.norm() > 1e3 * limit)
-
-
-def _with_contacts(potential: Potential, problem: StepProblem, taken: StepProblem) -> StepProblem:
-    """The problem with the contacts that its step was taken with, following body and cloth."""
-    obstacle, problem = problem.step.obstacle, replace(problem, layers=taken.layers)
-    if obstacle is not None and taken.contact is not None:
-        contact, second = moving_contacts(taken.contact, taken.second_contact, problem.state.pos, obstacle)
-        problem = replace(problem, contact=contact, second_contact=second)
-    internal = potential.asked_internal(problem)
-    if internal is None:
-        return problem
-    pos = problem.state.pos
-    # Apart from the positions at t that the energies themselves know.
-    at = pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
-    (slope,) = torch.autograd.grad(internal.total(problem, at).sum(), at, create_graph=True)
-    return replace(problem, internal_force=-slope)
+    return x, not bool(r.norm() > 1e2 * limit)
 
 
 def _detached(cloth: Cloth, plain: Mapping[int, Tensor]) -> Cloth:

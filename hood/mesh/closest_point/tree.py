@@ -16,9 +16,10 @@ from torch import Tensor
 
 from hood import native
 from hood.mesh.geometry import MOST_CURVATURE, ROUNDS
+from hood.mesh.topology import unique_edges
 from hood.native.arguments import COUNT, POINTER, REAL, fields, num_parts
 from hood.native.build import optional
-from hood.tensors.batch import forget
+from hood.tensors.batch import forget, made_of
 
 SOURCE = Path(native.__file__).with_name("surface.cpp")
 #: Faces of a leaf, as in the source, and bytes of a line of the cache.
@@ -332,6 +333,31 @@ def moved(start: np.ndarray, end: np.ndarray) -> tuple[float, float] | None:
     both, found = [np.ascontiguousarray(points, np.float64) for points in (start, end)], np.empty(2)
     lib.surface_moved(COUNT(len(start)), *(POINTER(array.ctypes.data) for array in (*both, found)))
     return float(np.degrees(found[0])), float(found[1])
+
+
+@torch.no_grad()
+def skin(vertices: Tensor, faces: Tensor, incidence: Sequence[Tensor], curved: bool) -> tuple[Tensor, Tensor] | None:
+    """Unit normals (W, 3) and curvatures [1/m] (W,) of a surface at its vertices (W, 3), on a CPU, as
+    :mod:`hood.mesh.geometry` has them; curvatures of 0 unless it is to be ``curved``. None without a compiler.
+
+    Args:
+        faces: (G, 3).
+        incidence: :attr:`hood.mesh.closest_point.search.Incidence.adjacency` of ``faces``.
+    """
+    lib = library() if vertices.device.type == "cpu" else None
+    if lib is None:
+        return None
+    made = made_of(faces)
+    if "skin" not in made:
+        tables = faces.numpy(), unique_edges(faces.numpy()), *(tensor.numpy() for tensor in incidence[:3])
+        made["skin"] = [np.ascontiguousarray(table, np.int64) for table in tables]
+    count = len(vertices)
+    normals, of_face, curvature = np.empty((count, 3)), np.empty(len(faces)), np.empty(count)
+    arrays = *made["skin"], _double(vertices), normals, of_face, curvature
+    counts = len(faces), len(made["skin"][1]) if curved else 0, count
+    pointers = (POINTER(array.ctypes.data) for array in arrays)
+    lib.surface_curvature(*map(COUNT, counts), *pointers, REAL(MOST_CURVATURE), COUNT(ROUNDS if curved else 0))
+    return torch.from_numpy(normals), torch.from_numpy(curvature)
 
 
 @torch.no_grad()

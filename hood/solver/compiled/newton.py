@@ -102,9 +102,11 @@ def library(wide: bool = False) -> ctypes.CDLL:
     lib.newton_model.restype = REAL
     lib.newton_move.argtypes = [POINTER, REAL, COUNT]
     lib.newton_matrix.argtypes = [POINTER, REAL]
+    lib.newton_solve.argtypes = [POINTER, POINTER, REAL, COUNT, POINTER]
+    lib.newton_exact.argtypes = [POINTER] * 2
     lib.newton_alone.argtypes = [POINTER] * 4
     lib.newton_together.argtypes = [POINTER, POINTER, POINTER, COUNT, POINTER]
-    for name in ("newton_move", "newton_face_record", "newton_hinge_record"):
+    for name in ("newton_move", "newton_solve", "newton_face_record", "newton_hinge_record"):
         getattr(lib, name).restype = COUNT
     return lib
 

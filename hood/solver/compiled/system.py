@@ -201,6 +201,19 @@ class CompiledScene:
         """The matrix of the model with a share of its indefinite part; a move makes its own."""
         self._lib.newton_matrix(self._address, indefinite_share)
 
+    def exact(self) -> None:
+        """The matrix becomes the Hessian at a state whose model has been made; of layers of cloth, of the published code's bending
+        and of terms of other classes it has what the model has."""
+        memory = self._memory[self.wide, self.values.parts]
+        if "curvature" not in memory:
+            memory["curvature"] = np.empty((self.values.num_hinges, 90), memory["matrix"].dtype)
+        self._lib.newton_exact(self._address, memory["curvature"].ctypes.data)
+
+    def solve(self, right: np.ndarray, tolerance: float, cg_iterations: int, found: np.ndarray) -> bool:
+        """Write the solution of matrix x = ``right`` (V, 3) into ``found`` (V, 3), at this scene's free vertices; whether the matrix
+        was positive definite as far as was seen."""
+        return bool(self._lib.newton_solve(self._address, right.ctypes.data, tolerance, cg_iterations, found.ctypes.data))
+
     def move(self, tolerance: float, cg_iterations: int) -> bool:
         """Take a Newton step from a state whose model has been made, by a linear system solved to a tolerance; whether it led
         anywhere."""
@@ -376,6 +389,11 @@ class CompiledSystem:
     def _apart(self, target: Tensor) -> Tensor:
         free = self.problem.cloth.free.unsqueeze(1)
         return approached(self._step.layers, torch.where(free, target, torch.from_numpy(self._step.fixed)))
+
+    @property
+    def engines(self) -> list[CompiledScene]:
+        """Those of the scenes, in their order."""
+        return self._engines
 
     def _start(self, pos: Tensor) -> None:
         acc = (_array(pos) - self._step.base) / self._dt_sq

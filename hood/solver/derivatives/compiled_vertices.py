@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.contact.contact import Contact
-from hood.contact.sample_points import chord_error
+from hood.contact.contact import AHEAD, Contact, skin_of
+from hood.contact.sample_points import MOST_SAG, MOST_STRETCHED, SAG_SHARE, chord_error
 from hood.energies.compiled_elements import library
 from hood.energies.contact import Collision, Walls
 from hood.energies.friction import Friction, Grip, scaled_by_body_friction
@@ -218,3 +218,83 @@ def contact_pass(problem: StepProblem, contact: Contact) -> ContactPass | None:
 
 def _addresses(tensors: list[Tensor]) -> list[ctypes.c_void_p]:
     return [POINTER(values.data_ptr()) for values in tensors]
+
+
+class _FollowedContact(ctypes.Structure):
+    """``FollowedContact`` of ``followed_contact.h``."""
+
+    _fields_ = fields("valid face bary dist normal raised", POINTER)
+
+
+class _Followed(ctypes.Structure):
+    """``Followed`` of ``followed_contact.h``."""
+
+    _fields_ = [
+        ("count", COUNT),
+        *fields("faces surface next_surface normals next_normals curvature friction_scale", POINTER),
+        ("first", _FollowedContact),
+        ("second", _FollowedContact),
+        *fields("scene mass friction edge_sq growth pos vel pull next_pos dt gravity", POINTER),
+        *fields("ahead sag_share most_sag most_stretched", REAL),
+    ]
+
+
+class _FollowedTerm(ctypes.Structure):
+    """``FollowedTerm`` of ``followed_contact.h``."""
+
+    _fields_ = [*fields("weight least", REAL), ("curved", COUNT), *fields("coefficient slip_speed", REAL)]
+
+
+class FollowedBody:
+    """Contact of a step with the body as C++ follows it, where the body itself is constant.
+
+    Args:
+        problem: of numbers alone, with its contacts and the forces of the cloth around.
+        next_pos: (V, 3) m.
+        growth: (V,) m² of the edges (:mod:`hood.contact.sample_points`), or None.
+    """
+
+    def __init__(self, problem: StepProblem, next_pos: Tensor, growth: Tensor | None) -> None:
+        contact, obstacle, cloth = problem.contact, problem.step.obstacle, problem.cloth
+        assert contact is not None
+        assert obstacle is not None
+        skin = skin_of(obstacle)
+        given = {"surface": obstacle.pos, "next_surface": obstacle.next_pos, "friction_scale": obstacle.friction_scale}
+        given |= {"normals": skin.normal, "next_normals": skin.next_normal, "curvature": skin.curvature}
+        given |= {"mass": cloth.mass, "friction": cloth.friction, "edge_sq": cloth.edge_length_sq, "growth": growth}
+        given |= {"pos": problem.state.pos, "vel": problem.state.vel, "pull": problem.searched_internal_force}
+        given |= {"next_pos": next_pos, "dt": problem.step.dt, "gravity": problem.gravity}
+        self._kept = [whole(values) for values in given.values() if values is not None]
+        self._values = _Followed(count=len(next_pos), ahead=AHEAD, sag_share=SAG_SHARE, most_sag=MOST_SAG)
+        self._values.most_stretched = MOST_STRETCHED
+        for name, values in zip((name for name, one in given.items() if one is not None), self._kept, strict=True):
+            setattr(self._values, name, values.data_ptr())
+        self._keep(self._values, "faces", obstacle.faces)
+        self._keep(self._values, "scene", cloth.vertex_scene)
+        self._take(self._values.first, contact)
+        if problem.second_contact is not None and problem.second_contact.contact is not None:
+            self._take(self._values.second, problem.second_contact.contact)
+
+    def along(self, term: Collision | Friction, direction: Tensor) -> Tensor:
+        """How the term's force along ``direction`` (V, 3) [m] changes, (V, 16) of every vertex: with its position at t (3) and its
+        velocity (3), with the force of the cloth around (3), its mass, its factor of friction, its mean square of the edges and
+        their growth; then what it is."""
+        both = (term.coefficient, term.slip_speed) if isinstance(term, Friction) else (0.0, 0.0)
+        own = _FollowedTerm(term.weight, term.epsilon, term.reach == "curvature", *map(float, both))
+        found = direction.new_zeros(len(direction), 16)
+        lib = library()
+        assert lib is not None
+        structures = ctypes.byref(self._values), ctypes.byref(own)
+        lib.elements_followed(*structures, *_addresses([whole(direction), found]))
+        return found
+
+    def _take(self, into: _FollowedContact, contact: Contact) -> None:
+        for name in ("valid", "face"):
+            self._keep(into, name, getattr(contact, name))
+        for name in ("bary", "dist", "normal", "raised"):
+            if getattr(contact, name) is not None:
+                self._keep(into, name, whole(getattr(contact, name)))
+
+    def _keep(self, into: ctypes.Structure, name: str, values: Tensor) -> None:
+        self._kept.append(values.contiguous())
+        setattr(into, name, self._kept[-1].data_ptr())
