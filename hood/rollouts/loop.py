@@ -140,9 +140,9 @@ def simulate(
         step = scene.step_input(start_frame + after.index, after.state)
         gravity = stepper.gravity.to(after.state.pos)
         stepper.search(potential.prepare(StepProblem(scene.cloth, after.state, step, gravity=gravity)))
-    rest = None
-    if after is not None or start is not None:
-        state = start if after is None else after.state
+    given, rest = start if after is None else after.state, None
+    if given is not None:
+        state = given
     elif settle == "equilibrium" and own_start(stepper, scene, start_frame) is None:
         state, rest = rest_state(stepper, scene, potential, relaxing_steps, start_frame, attachments)
     else:
