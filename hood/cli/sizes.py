@@ -15,7 +15,7 @@ from tqdm import tqdm
 from hood.app.common import output_folder, prepare_folder, require_package
 from hood.app.scene.garments import FITS
 from hood.app.settings.compose import ConfigError, load_config, plain, require_choice, shown
-from hood.app.settings.python_words import overrides
+from hood.app.settings.overrides import overrides
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import check_config, make_stepper, set_up, start_of
 from hood.assets.files.atomic import write_atomically

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.pickles.content import load_torch
-from hood.assets.pickles.unpickle import PICKLE_LIMIT
+from hood.assets.pickles.records import PICKLE_LIMIT
 from hood.model.graph.builder import BODY, MESH, SCHEDULES, Step, edge_set_names, parse_schedule
 from hood.steppers.network import NetworkStepper, build_simulator
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from torch.optim.lr_scheduler import CosineAnnealingLR, SequentialLR
 
 from hood.app.settings.compose import load_config
-from hood.app.settings.python_words import overrides
+from hood.app.settings.overrides import overrides
 from hood.app.train import make_trainer
 from hood.cli.main import main
 from hood.training.callbacks import EarlyStopping

@@ -21,7 +21,7 @@ from workshop import Workshop, write_obj
 from hood.assets.garment.garment import Garment, load_garment, save_garment
 from hood.cli.main import main
 from hood.rollouts.file.recorder import RolloutWriter
-from hood.studies.envelope.prose import BEGIN, END
+from hood.studies.envelope.page import BEGIN, END
 from hood.testing import cylinder, sphere
 
 #: What makes a training short; the model and its weights are as large as the line's.

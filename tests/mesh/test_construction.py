@@ -13,7 +13,6 @@ import hood
 from hood.assets.body.body import Body
 from hood.assets.fitting.alterations import keep_faces
 from hood.assets.garment.garment import Garment, checked_garment, load_garment, save_garment
-from hood.assets.garment.mirror import mirror_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.parts import elasticated, part_faces
 from hood.assets.garment.pins import region_loop
@@ -25,6 +24,7 @@ from hood.mesh.flat import Construction, laid_out, stretched_sides
 from hood.mesh.topology import unique_edges
 from hood.scene.sizing import resized
 from hood.testing import cylinder, grid, make_problem
+from hood.training.scenes import mirror_garment
 
 F64 = torch.float64
 

@@ -11,7 +11,6 @@ import torch
 
 import hood
 from hood.assets.garment.garment import Garment, load_garment, save_garment
-from hood.assets.garment.mirror import mirror_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.material import Material
 from hood.cloth.cloth import Cloth, build_cloth, concatenate_cloths
@@ -20,6 +19,7 @@ from hood.energies.potential import default_potential
 from hood.mesh.flat import edge_extents, edge_lengths, followed, inverse, laid_out
 from hood.scene.sizing import resized
 from hood.testing import cylinder, grid, make_problem
+from hood.training.scenes import mirror_garment
 
 
 def _tube(

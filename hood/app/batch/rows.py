@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from hood.app.batch.batch import place_motions, require_motions
 from hood.app.settings.compose import ConfigError, load_config, options, plain, shown
-from hood.app.settings.python_words import overrides
+from hood.app.settings.overrides import overrides
 from hood.assets.files.library import locate, names, unknown
 from hood.assets.files.text import read_text
 from hood.assets.garment.garment import locate_garment

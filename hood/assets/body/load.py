@@ -21,7 +21,7 @@ from torch import Tensor
 from hood.assets.body.body import Body, axis_angle_to_matrix
 from hood.assets.files.library import SIZE_LIMIT, locate, read_arrays, unknown_suffix
 from hood.assets.motion.sequence import PoseSequence
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.pickles.records import load_pickle
 
 #: Number of joints in a file → name of the model.
 FAMILY = {24: "smpl", 52: "smplh", 55: "smplx"}

@@ -19,7 +19,7 @@ from hood.assets.files.guarded import first_line, own_dataset
 from hood.assets.files.library import SIZE_LIMIT, read_arrays
 from hood.assets.files.text import rates_in
 from hood.assets.formats.mesh_file import MeshFile, read_mesh, read_mesh_file
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.pickles.records import load_pickle
 
 #: Names of the tables; the last pair is the body of a ``rollout.h5``.
 VERTEX_KEYS = ("verts", "vertices", "body/pos")

@@ -11,7 +11,7 @@ import numpy as np
 from hood.assets.files.guarded import listed
 from hood.assets.files.library import unknown
 from hood.assets.garment.garment_arrays import check_rows, normalised
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.pickles.records import load_pickle
 
 #: Value of ``node_type`` of vertices that are held: they move with the body.
 _HANDLE = 3

@@ -1,6 +1,6 @@
 """The content of pickles that hold arrays in any of the usual ways: numpy's, torch's, joblib's, and files of ``torch.save``.
 
-Like every pickle here they are read by :class:`hood.assets.pickles.unpickle.RestrictedUnpickler`: nothing they name is run.
+Like every pickle here they are read by :class:`hood.assets.pickles.records.RestrictedUnpickler`: nothing they name is run.
 ``torch.load(weights_only=True)`` refuses a whole file for one configuration object in it; here such objects become
 opaque records and the weights beside them can be read.
 """
@@ -23,8 +23,7 @@ import torch
 from torch import Tensor
 
 from hood.assets.files.guarded import Refused, check_size, guarded
-from hood.assets.pickles.records import Function, Record, read_raw_array, resolve
-from hood.assets.pickles.unpickle import PICKLE_LIMIT, Bounded, RestrictedUnpickler
+from hood.assets.pickles.records import PICKLE_LIMIT, Bounded, Function, Record, RestrictedUnpickler, read_raw_array, resolve
 
 #: Packages whose objects checkpoints carry beside the weights: configurations, and the classes they describe. Only their
 #: names are kept; none of them is imported.

@@ -39,8 +39,7 @@ from hood.studies.envelope.judge import (
     usual_of,
     worst,
 )
-from hood.studies.envelope.page import Curve, View, small_sheet, write_map_page
-from hood.studies.envelope.prose import require_marks, write_section
+from hood.studies.envelope.page import Curve, View, require_marks, small_sheet, write_map_page, write_section
 from hood.studies.envelope.tasks import REFERENCE, Task, command_of, make_tasks, read_judged, weights_of, write_inputs
 from hood.studies.processes import Ended, interruptible, run_beside
 from hood.training import distributed

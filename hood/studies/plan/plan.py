@@ -20,8 +20,8 @@ from hood.app.common import held_folder, output_folder
 from hood.app.notices import say
 from hood.app.plan_file import FREE, content_digest, key_of, plan_accuracy, read_plan, write_plan
 from hood.app.settings.compose import ConfigError, load_config, named_today, plain, with_words
+from hood.app.settings.overrides import overrides as overrides_of
 from hood.app.settings.overrides import plain_word
-from hood.app.settings.python_words import overrides as overrides_of
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.assets.files.library import locate
@@ -31,9 +31,8 @@ from hood.studies.plan.ablation import LEAD, Begun, Effect
 from hood.studies.plan.decide import QUANTILE, Combination, Tolerance
 from hood.studies.plan.discretisation import Apart
 from hood.studies.plan.mesh_facts import differences, facts, reach_sentence, show
-from hood.studies.plan.page import Difference
+from hood.studies.plan.page import Difference, describe_plan, plan_command, sentence
 from hood.studies.plan.probe import HOLD, AskedOf, Probed, probe
-from hood.studies.plan.table import describe_plan, plan_command, sentence
 
 #: Words of these keys belong to a training, and to no rollout.
 _TRAINING_GROUPS = ("experiment", "trainer", "data")

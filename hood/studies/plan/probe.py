@@ -38,8 +38,8 @@ from hood.studies.plan.decide import (
     most_accurate,
 )
 from hood.studies.plan.discretisation import Apart, Elsewhere, Reference, common_points, measure_elsewhere
+from hood.studies.plan.page import broken, of_choice, of_parts, with_it
 from hood.studies.plan.parts import Part, choose_parts
-from hood.studies.plan.table import broken, of_choice, of_parts, with_it
 
 #: With a length, γ may be so many times that of the windows, and this at least, before left-out energies come back.
 _TIMES_PROBED, _LEAST_LIMIT = 3.0, 1e-3

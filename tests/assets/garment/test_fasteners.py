@@ -12,10 +12,10 @@ import pytest
 from hood.assets.fitting.alterations import clean, sew
 from hood.assets.garment.fasteners import ROOM, fasten, with_room
 from hood.assets.garment.garment import Garment, load_garment, save_garment
-from hood.assets.garment.mirror import mirror_garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.record import start_fitting
 from hood.testing import grid
+from hood.training.scenes import mirror_garment
 
 
 def halves(gap: float = 0.0) -> Garment:

@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 
 from hood.assets.pickles.content import load_torch
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.pickles.records import load_pickle
 
 FORMATS = {"zip": True, "stream": False}
 

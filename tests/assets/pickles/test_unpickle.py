@@ -15,7 +15,7 @@ import pytest
 from imitations import Ch, Select
 from scipy import sparse
 
-from hood.assets.pickles.unpickle import load_pickle
+from hood.assets.pickles.records import load_pickle
 
 CONTENT = {
     "fortran": np.asfortranarray(np.arange(12.0).reshape(3, 4)),

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hood.studies.envelope.judge import DEGRADED, REFUSED, SILENT, SOUND
-from hood.studies.envelope.prose import BEGIN, END, holds, map_section, write_section
+from hood.studies.envelope.page import BEGIN, END, holds, map_section, write_section
 
 
 def rows(factor: str, kinds: dict[str, str], model: str = "newton", garment: str = "dress") -> list[dict[str, Any]]:

@@ -52,7 +52,7 @@ def test_every_part_is_measured_and_decided(made: Path) -> None:
 
 
 def test_the_printed_table_names_parts_and_command(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from hood.studies.plan.table import describe_plan
+    from hood.studies.plan.page import describe_plan
 
     text = describe_plan(read(made))
     assert "bending" in text
