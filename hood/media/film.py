@@ -59,7 +59,6 @@ _SMOOTHING = 15  # frames over which the camera averages the walker's path
 AZIMUTHS = {"front": 20.0, "side": 90.0, "back": 200.0}
 #: The view that goes round.
 TURNTABLE = "turntable"
-CAMERAS = ("follow", "fixed", "orbit")
 _ELEVATION = 8.0  # degrees
 #: Room around the body as a share of it, and directions of the circles that stand for it where the camera goes round.
 _WHOLE_MARGIN, _ROUND = 1.06, 24

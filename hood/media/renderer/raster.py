@@ -329,7 +329,7 @@ def _ragged(counts: IntArray) -> tuple[IntArray, IntArray]:
 _CREASE = 0.5
 
 
-def vertex_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
+def mean_normals(pos: _Array, faces: NDArray[np.int64]) -> _Array:
     """Area-weighted unit normals (V, 3)."""
     lib = library()
     if lib is not None:

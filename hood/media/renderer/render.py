@@ -33,9 +33,9 @@ from hood.media.renderer.raster import (
     creased,
     from_behind,
     library,
+    mean_normals,
     packed,
     unit,
-    vertex_normals,
 )
 from hood.media.renderer.shading import (
     AROUND,
@@ -51,7 +51,7 @@ from hood.media.renderer.shading import (
     node_pixels,
     openness,
 )
-from hood.media.renderer.view import View
+from hood.media.renderer.view import ViewedSurface
 from hood.mesh.editing.subdivision import Extrusion
 from hood.mesh.topology import connected_components, counted_edges
 
@@ -246,7 +246,7 @@ def render_views(
     dark, lib, pictures = dark_map(surface, floor_height), library(), []
     for camera in cameras:
         light = Light(camera, surface.pos, surface.faces, "shadow", surface.closed)
-        view = View.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
+        view = ViewedSurface.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
         if lib is None:
             pictures.append(_drawn(camera, light, surface, view, prints, floor_height, (width, height), dark, background))
             continue
@@ -263,7 +263,7 @@ def _drawn(
     camera: Camera,
     light: Light,
     surface: Surface,
-    view: View,
+    view: ViewedSurface,
     prints: Sequence[tuple[int, Print]],
     floor: float,
     size: tuple[int, int],
@@ -351,7 +351,7 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
             raise ValueError(f"render_frame: mesh {index}: hem is {hem.shape}, needs ({len(pos)},)")
         behind = np.full(len(pos), mesh.behind)
         shine = np.broadcast_to(np.asarray(mesh.shine, dtype=np.float64), pos.shape)
-        normal = vertex_normals(pos, faces)
+        normal = mean_normals(pos, faces)
         faces, carrier, own = creased(pos, faces, normal)
         rows = [values[carrier] for values in (pos, linear, normal, hem, behind, shine)]
         rows[2][len(pos) :] = own
@@ -373,7 +373,7 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
 
 
 def _draw_surface(
-    image: _Array, camera: Camera, light: Light, surface: Surface, view: View, prints: Sequence[tuple[int, Print]]
+    image: _Array, camera: Camera, light: Light, surface: Surface, view: ViewedSurface, prints: Sequence[tuple[int, Print]]
 ) -> None:
     row, column, corners, weights = view.covered()
     if len(row) == 0:
@@ -396,7 +396,7 @@ def _draw_surface(
 
 def _normals(
     surface: Surface,
-    view: View,
+    view: ViewedSurface,
     row: NDArray[np.integer],
     column: NDArray[np.integer],
     corners: NDArray[np.int64],
@@ -408,7 +408,7 @@ def _normals(
     return normal
 
 
-def _nodes(axes: _Array, light: Light, surface: Surface, view: View) -> Nodes:
+def _nodes(axes: _Array, light: Light, surface: Surface, view: ViewedSurface) -> Nodes:
     half = VisibilityBuffer(view.buffer.face[::2, ::2], view.buffer.nearness[::2, ::2])
     there, rows, columns = node_pixels(half.face)
     row, column = rows[there], columns[there]
@@ -424,7 +424,7 @@ def _nodes(axes: _Array, light: Light, surface: Surface, view: View) -> Nodes:
 
 
 def _seen_values(
-    camera: Camera, surface: Surface, view: View, prints: Sequence[tuple[int, Print]]
+    camera: Camera, surface: Surface, view: ViewedSurface, prints: Sequence[tuple[int, Print]]
 ) -> tuple[SeenValues, list[NDArray[np.generic]]]:
     """What :func:`_draw_surface` needs, for the compiled drawing, and the arrays that it points to."""
     height, width = view.buffer.face.shape

@@ -15,7 +15,7 @@ _Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class View:
+class ViewedSurface:
     """A surface as the camera sees it, in the rectangle of samples of the picture that it covers."""
 
     number: NDArray[np.int64]  # (N,) of the faces that are not behind the camera
@@ -29,7 +29,7 @@ class View:
     middle: tuple[float, float]  # where the camera looks, samples across and down
 
     @classmethod
-    def of(cls, camera: Camera, surface: Surface, width: int, height: int) -> View:
+    def of(cls, camera: Camera, surface: Surface, width: int, height: int) -> ViewedSurface:
         seen = (surface.pos - np.asarray(camera.position)) @ camera.axes().T
         number, faces = np.arange(len(surface.faces)), surface.faces
         if seen[:, 2].min() <= NEAR:
