@@ -127,7 +127,7 @@ def require_distinct(key: str, values: Sequence[Any]) -> None:
         raise ConfigError(f"{key}: {twice!r} is given twice; leave one out")
 
 
-def thinning(config: Settings) -> float:
+def thinning(config: DictConfig) -> float:
     """[m] of ``config.thin_body`` of a command that has it as a key, which is in millimetres.
 
     Raises:
@@ -153,7 +153,8 @@ def picture_of(config: Settings, film: str = "mp4") -> PictureSettings:
     strange = next((name for name in table if name not in usual._fields), None)
     if strange is not None:
         raise ConfigError(f"picture={brief(value)}: {strange!r} is no part of it; give some of {', '.join(usual._fields)}")
-    given = usual._replace(**{name: tuple(part) if isinstance(part, list) else part for name, part in table.items()})
+    parts: dict[str, Any] = {name: tuple(part) if isinstance(part, list) else part for name, part in table.items()}
+    given = usual._replace(**parts)
     views = given.views if isinstance(given.views, tuple) else (given.views,)
     given = given._replace(views=views)
     for name, (is_right, fix) in _PARTS.items():

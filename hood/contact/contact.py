@@ -162,8 +162,8 @@ def skin_of(obstacle: Obstacle) -> Skin:
         now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
         if now is not None and later is not None:
             return Skin(now[0], later[0], now[1])
-    normals = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
-    return Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+    normal, after = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
+    return Skin(normal, after, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 
 
 def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: Skin) -> Contact:

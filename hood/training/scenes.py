@@ -348,10 +348,6 @@ def mirror_garment(garment: Garment) -> Garment:
     return replace(garment, **image)
 
 
-#: Corner tables of a garment: turned over with its faces.
-_CORNERS = ("faces", "uv_faces", "normal_faces", *SIDE_TABLES)
-
-
 def _reversed(faces: np.ndarray) -> np.ndarray:
     """Triangles (F, 3) of the other winding."""
     return np.ascontiguousarray(faces[:, ::-1])

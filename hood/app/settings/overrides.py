@@ -260,7 +260,7 @@ def _is_balanced(value: str) -> bool:
 #: Keys of tables: names of parts in any alphabet, and of files.
 _KEY = re.compile(r"[\w./+@-]+")
 #: Keys of what is read from files, and how they are given.
-_NAMES = {
+_GIVEN_BY = {
     "garment": "a name, a file or a list of them, and to hood.simulate also by hood.Garment objects",
     "sequence": "a name (hood.names('motions')) or a file, and to hood.simulate also by a hood.PoseSequence",
     "body": "a name or a file, and to hood.simulate also by a hood.BodyMesh or a hood.Body",
@@ -289,8 +289,8 @@ def overrides(keys: Mapping[str, Any], group: str = "") -> list[str]:
 
 
 def _word(value: Any, key: str) -> str:
-    if key in _NAMES and not _may_name(value):
-        raise ConfigError(f"{key} is given by {_NAMES[key]}, not as {_sort(value)}")
+    if key in _GIVEN_BY and not _may_name(value):
+        raise ConfigError(f"{key} is given by {_GIVEN_BY[key]}, not as {_sort(value)}")
     if getattr(value, "requires_grad", False):
         raise ConfigError(f"{key}: {NO_GRADIENT}")
     if hasattr(value, "tolist"):  # of NumPy or torch

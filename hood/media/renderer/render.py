@@ -367,9 +367,8 @@ def _join(meshes: Sequence[RenderMesh]) -> Surface:
         parts.append((rows[0], faces + offset, *rows[1:]))  # type: ignore[arg-type]
         offset += len(carrier)
     outer = takewhile(lambda mesh: mesh.closed, meshes)
-    return Surface(
-        *(np.concatenate(column) for column in zip(*parts, strict=True)), sum(len(np.asarray(m.faces)) for m in outer)
-    )
+    pos, corners, color, normal, hem, behind, shine = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Surface(pos, corners, color, normal, hem, behind, shine, sum(len(np.asarray(mesh.faces)) for mesh in outer))
 
 
 def _draw_surface(

@@ -133,7 +133,7 @@ def node_pixels(face: NDArray[np.integer]) -> tuple[NDArray[np.bool_], NDArray[n
     seen[: face.shape[0], : face.shape[1]] = face >= 0
     four = seen.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)
     first = four.argmax(axis=2)
-    return four.any(axis=2), 2 * np.arange(rows)[:, None] + first // 2, 2 * np.arange(columns)[None] + first % 2
+    return np.asarray(four.any(axis=2)), 2 * np.arange(rows)[:, None] + first // 2, 2 * np.arange(columns)[None] + first % 2
 
 
 def _positions(
