@@ -34,7 +34,7 @@ from hood.model.kernels.block import KERNELS
 from hood.rollouts.frame import METRIC_CHOICES, SETTLE_CHOICES
 from hood.rollouts.loop import own_start
 from hood.rollouts.verdict.doubts import doubt_body, doubt_fabric
-from hood.scene.following import with_held_layers_apart
+from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene, dressed_scene
 from hood.scene.worn import doubts, misplacement
 from hood.steppers.network import NetworkStepper

@@ -10,7 +10,7 @@ from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.motion.sequence import PoseSequence
-from hood.scene.following import MOST_MOVED, with_held_layers_apart
+from hood.scene.held_layers import MOST_MOVED, with_held_layers_apart
 from hood.scene.scene import Scene, build_scene
 from hood.scene.untangle import TangledError
 

@@ -16,7 +16,7 @@ from hood.app.stepping.refinement import refined
 from hood.app.stepping.steppers import make_solver, option_of, with_stepper
 from hood.assets.files.library import names
 from hood.energies.self_contact import for_networks
-from hood.scene.following import with_held_layers_apart
+from hood.scene.held_layers import with_held_layers_apart
 from hood.scene.scene import Scene
 from hood.steppers.static_shapes.simulator import network_of
 from hood.studies.plan.ablation import Variant
