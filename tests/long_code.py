@@ -19,7 +19,7 @@ MODULES = {
     "hood/assets/garment/garment_arrays.py": "every field of a garment file: read, checked and written",
     "hood/assets/motion/layouts/people.py": "who is in a motion file, in one table or an entry a frame",
     "hood/contact/contact.py": "what a contact is, its two searches in two forms, and how its points move",
-    "hood/rollouts/differentiable.py": "one derivative: what it is by, the contacts and the system behind it",
+    "hood/rollouts/adjoint.py": "one derivative of a force, written out or by autograd, and the system behind it",
     "hood/native/build.py": "one way to a compiled library: at hand, from a wheel, or made",
     "hood/assets/pattern/bottoms.py": "designs of one kind, each a draft of its panels",
     "hood/assets/pattern/fronts.py": "what opens in front: panels, collars and lapels drawn, then cut open once they are sewn",

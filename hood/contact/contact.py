@@ -159,11 +159,11 @@ def skin_of(obstacle: Obstacle) -> Skin:
     both = obstacle.pos, obstacle.next_pos
     if not any(pos.requires_grad for pos in both):
         given = obstacle.faces, incidence.adjacency
-        now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
-        if now is not None and later is not None:
-            return Skin(now[0], later[0], now[1])
-    normals = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
-    return Skin(*normals, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+        found, next_found = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
+        if found is not None and next_found is not None:
+            return Skin(found[0], next_found[0], found[1])
+    now, later = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
+    return Skin(now, later, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 
 
 def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: Skin) -> Contact:

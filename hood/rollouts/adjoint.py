@@ -1,7 +1,7 @@
 """How the force of a step changes with everything that it depends on, and the linear system of its adjoint.
 
-Of membrane, bending about the rest shape, inertia, weight, and contact and friction of vertices with a body that is constant, the
-derivatives are written out, in C++ (``hood/native/elements.cpp``). Those of other terms, and of all terms where there is no
+Of membrane, bending about the rest shape, inertia, weight, and contact and friction of vertices with a body that is constant,
+the derivatives are written out, in C++ (``hood/native/elements.cpp``). Those of other terms, and of all terms where there is no
 compiler, are found by autograd, which differentiates their energies twice.
 """
 
@@ -300,7 +300,7 @@ class Preconditioner:
 
 
 def _compiled(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor) -> CompiledSystem | None:
-    """The compiled solver with the Hessian at ``pos`` (V, 3); None where it does not take the problem, or there is no compiler."""
+    """The compiled solver with the Hessian at ``pos`` (V, 3); None where it does not take the problem or was not compiled."""
     if not newton.applies(potential, problem):
         return None
     try:
