@@ -63,6 +63,7 @@ MODULES = {
     "hood/scene/scene.py": "one scene: its start, what each step prescribes, and how it is built",
     "hood/scene/untangle.py": "one procedure: the order of the layers, then their separation",
     "hood/solver/compiled/system.py": "one object in C++: its buffers, its calls, its float64 form",
+    "hood/solver/derivatives/compiled_vertices.py": "one contact as C++ reads it: its planes, its grips, and how both follow",
     "hood/solver/derivatives/elements.py": "energies and derivatives of every element, and the damping of the same forms",
     "hood/solver/newton.py": "Newton's method: settings, report, iterations, and the same from any place",
     "hood/steppers/static_shapes/newton_pieces.py": "the pieces of one Newton step, and the two ways through them",
