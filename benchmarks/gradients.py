@@ -3,10 +3,10 @@
     python benchmarks/gradients.py
     python benchmarks/gradients.py --garments dress_4k --steps 4 --rounds 3 --memory-steps 20
 
-The dress walks (`walk_brisk`), with contact and friction. Differentiated are the mean height of the last frame by two moduli of the
-fabric and its density, through all positions and velocities in between. Rounds of so many steps forward and backward follow each
-other; of their times a step the medians are told. Memory is what a process of its own, which takes so many steps forward and
-backward, needs more than it had after its first round.
+The dress walks (`walk_brisk`), with contact and friction. The mean height of the last frame is differentiated by three numbers
+of the fabric, through all positions and velocities in between. Rounds of so many steps forward and backward follow each other;
+of their times a step the medians are told. Memory is what a process of its own, which takes so many steps forward and backward,
+needs more than it had before.
 """
 
 from __future__ import annotations
@@ -74,9 +74,8 @@ def main() -> None:
         many()
         print(peak() - before)
         return
-    print(
-        f"{'garment':12}{'vertices':>10}{'forward ms':>12}{'backward ms':>13}{'ratio':>7}{f'MB, {given.memory_steps} steps':>16}"
-    )
+    memory = f"MB, {given.memory_steps} steps"
+    print(f"{'garment':12}{'vertices':>10}{'forward ms':>12}{'backward ms':>13}{'ratio':>7}{memory:>16}")
     for garment in given.garments:
         run = Round(garment, given.motion, given.steps)
         run()  # compiles, and fills tables

@@ -145,7 +145,7 @@ def moving_contacts(
     return first, SecondContact(replace(other, dist=torch.where(other.valid, dist, other.dist)))
 
 
-class Skin(NamedTuple):
+class BodyAtVertices(NamedTuple):
     """The body at its vertices: unit normals (W, 3) at t and t + 1, curvatures (W,) [1/m] at t."""
 
     normal: Tensor
@@ -153,20 +153,20 @@ class Skin(NamedTuple):
     curvature: Tensor
 
 
-def skin_of(obstacle: Obstacle) -> Skin:
+def skin_of(obstacle: Obstacle) -> BodyAtVertices:
     """The body at its vertices, which autograd follows where it moves them."""
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))
     both = obstacle.pos, obstacle.next_pos
     if not any(pos.requires_grad for pos in both):
         given = obstacle.faces, incidence.adjacency
-        now, later = (tree.skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
-        if now is not None and later is not None:
-            return Skin(now[0], later[0], now[1])
-    normal, after = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
-    return Skin(normal, after, convex_curvature(obstacle.pos, obstacle.faces, incidence))
+        found, next_found = (tree.vertex_skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
+        if found is not None and next_found is not None:
+            return BodyAtVertices(found[0], next_found[0], found[1])
+    now, later = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
+    return BodyAtVertices(now, later, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 
 
-def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: Skin) -> Contact:
+def _moving(contact: Contact, at: Tensor, obstacle: Obstacle, skin: BodyAtVertices) -> Contact:
     """A contact whose closest points follow the positions ``at`` (V, 3) and the body."""
     face = torch.where(contact.valid, contact.face, 0)
     corners = obstacle.faces[face]

@@ -151,7 +151,7 @@ def element_energies(
 
 def along_membrane(cloth: Cloth, pos: np.ndarray, direction: np.ndarray, product: np.ndarray) -> np.ndarray:
     """How the slope of the membrane's energy at ``pos`` (V, 3) along ``direction`` (V, 3) [m] changes with the numbers of every
-    face, (9, F): volume; μ and λ and two zeros, or the roots of its weave; the four of the inverse rest edges. The product of the
+    face, (9, F): volume; μ, λ and two zeros, or the roots of its weave; the four of the inverse rest edges. The product of the
     Hessian with the direction is added to ``product`` (V, 3). All float64 without gaps."""
     faces = _constants_of(cloth).faces
     return _along(library().elements_faces_along, faces, 9, pos, direction, product)  # type: ignore[union-attr]

@@ -1,7 +1,7 @@
 """How the force of a step changes with everything that it depends on, and the linear system of its adjoint.
 
-Of membrane, bending about the rest shape, inertia, weight, and contact and friction of vertices with a body that is constant, the
-derivatives are written out, in C++ (``hood/native/elements.cpp``). Those of other terms, and of all terms where there is no
+Of membrane, bending about the rest shape, inertia, weight, and contact and friction of vertices with a body that is constant,
+the derivatives are written out, in C++ (``hood/native/elements.cpp``). Those of other terms, and of all terms where there is no
 compiler, are found by autograd, which differentiates their energies twice.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,16 +19,13 @@ from hood.cloth.cloth import Cloth
 from hood.contact.contact import moving_contacts
 from hood.contact.sample_points import edge_growth
 from hood.energies import compiled_elements
-from hood.energies.bending import Bending, bending_weight
-from hood.energies.contact import Collision
-from hood.energies.friction import Friction
+from hood.energies.bending import bending_weight
 from hood.energies.laws import slip_slope
-from hood.energies.mass_points import Gravity, Inertia
-from hood.energies.membrane import Stretching, weave_roots
+from hood.energies.membrane import weave_roots
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, dot_rows
 from hood.energies.self_contact import has_layers
-from hood.energies.term import Energy, Role
+from hood.energies.term import Form, Role, Term, having, kind_of, role_of
 from hood.native.build import BuildError
 from hood.solver.compiled import newton
 from hood.solver.compiled.system import CompiledSystem
@@ -68,42 +66,42 @@ def slopes_along(potential: Potential, problem: StepProblem, taken: StepProblem,
     yield from _of_elements(kinds, cloth, taken.cloth, pos, way, along)
     if fixed.requires_grad:
         yield fixed, torch.where(free, 0.0, along)
-    dt, points = taken.vertex_dt, () if problem.step.dt.requires_grad else (Inertia, Gravity)
-    for term in rest.active(taken).values():
-        if type(term) is Inertia and Inertia in points:
-            pull = taken.cloth.mass.unsqueeze(1) * way
-            yield cloth.mass, dot_rows(way, taken.acceleration(pos))
+    dt, active = taken.vertex_dt, rest.active(taken)
+    points = {} if problem.step.dt.requires_grad else having(active, Form.MASS, Form.WEIGHT)
+    for term in points.values():
+        found = term.closed_form(problem)
+        if term.form is Form.WEIGHT:
+            yield found, -way
+        else:
+            pull = found.detach().unsqueeze(1) * way
+            yield found, dot_rows(way, taken.acceleration(pos))
             yield state.pos, -pull / dt**2
             yield state.vel, -pull / dt
-        elif type(term) is Gravity and Gravity in points:
-            yield cloth.mass, -(way @ taken.gravity.to(way))
-            yield problem.gravity, -(taken.cloth.mass @ way)
     on_body = _followed(rest, problem, taken)
     if on_body:
         yield from _of_body(potential, on_body, problem, taken, pos, way)
-    others = {name: term for name, term in rest.active(taken).items() if name not in on_body}
-    others = {name: term for name, term in others.items() if type(term) not in points}
+    others = {name: term for name, term in active.items() if name not in on_body and name not in points}
     if others:
-        moving = any(isinstance(term, Energy) and _reads_contact(term, taken) for term in others.values())
+        moving = any(_reads_contact(term, taken) for term in others.values())
         problem = with_contacts(potential, problem, taken) if moving else _with_constant_contacts(problem, taken)
-        value = (way * force(potential.only(others), problem, torch.where(free, pos, fixed))).sum()
+        value = (way * force_of(potential.only(others), problem, torch.where(free, pos, fixed))).sum()
         yield value, torch.ones_like(value)
 
 
-def _written_out(potential: Potential, taken: StepProblem) -> tuple[list[type], Potential]:
+def _written_out(potential: Potential, taken: StepProblem) -> tuple[list[str], Potential]:
     """The kinds of energies of elements whose derivatives are written out, and the other terms."""
     if not compiled_elements.applies(taken.state.pos):
         return [], potential
-    own = {name: term for name, term in potential.terms.items() if type(term) in (Stretching, Bending)}
-    kinds = [type(term) for term in own.values() if term.applies(taken)]
+    own = {name: term for name, term in potential.terms.items() if kind_of(term) in ("Stretching", "Bending")}
+    kinds = [kind_of(term) for term in own.values() if term.applies(taken)]
     return kinds, potential.only({name: term for name, term in potential.terms.items() if name not in own})
 
 
-def _of_elements(kinds: list[type], cloth: Cloth, known: Cloth, pos: Tensor, way: Tensor, along: Tensor) -> Iterator[Slope]:
+def _of_elements(kinds: list[str], cloth: Cloth, known: Cloth, pos: Tensor, way: Tensor, along: Tensor) -> Iterator[Slope]:
     """Those of elements by the numbers of the cloth; the product of their Hessian with ``way`` is added to ``along``."""
     given = compiled_elements.as_double(pos), compiled_elements.as_double(way), along.numpy()
     for kind in kinds:
-        if kind is Bending:
+        if kind == "Bending":
             by = torch.from_numpy(compiled_elements.along_bending(known, *given))
             yield cloth.rest_angle, by[1]
             yield bending_weight(cloth.bending_stiffness, cloth.hinge_rest_length**2, cloth.hinge_area), by[0]
@@ -119,7 +117,7 @@ def _of_elements(kinds: list[type], cloth: Cloth, known: Cloth, pos: Tensor, way
             yield roots, by[1:5]
 
 
-def _followed(potential: Potential, problem: StepProblem, taken: StepProblem) -> dict[str, Collision | Friction]:
+def _followed(potential: Potential, problem: StepProblem, taken: StepProblem) -> dict[str, Any]:
     """The terms of contact and friction that C++ follows: at vertices, on a body and in time steps that are constant."""
     obstacle = problem.step.obstacle
     body = () if obstacle is None else (getattr(obstacle, spec.name) for spec in fields(obstacle))
@@ -128,17 +126,17 @@ def _followed(potential: Potential, problem: StepProblem, taken: StepProblem) ->
     if obstacle is None or moves or not compiled_elements.applies(taken.state.pos) or not len(obstacle.faces):
         return {}
     found = {}
-    for name, term in potential.active(taken).items():
-        if isinstance(term, (Collision, Friction)) and type(term) in (Collision, Friction) and term.sides == "both":
-            numbers = (value for key, value in vars(term).items() if key != "coefficient")
-            if term.contact == "vertices" and not any(isinstance(value, Tensor) for value in numbers):
-                found[name] = term
+    for name, term in having(potential.active(taken), Role.CONTACT, Role.FRICTION).items():
+        numbers = (value for key, value in vars(term).items() if key != "coefficient")
+        known = kind_of(term) in ("Collision", "Friction") and term.sides == "both" and term.contact == "vertices"
+        if known and not any(isinstance(value, Tensor) for value in numbers):
+            found[name] = term
     return found
 
 
 def _of_body(
     potential: Potential,
-    terms: dict[str, Collision | Friction],
+    terms: dict[str, Any],
     problem: StepProblem,
     taken: StepProblem,
     pos: Tensor,
@@ -150,7 +148,7 @@ def _of_body(
     for term in terms.values():
         by = body.along(term, way)
         total += by
-        if isinstance(term, Friction) and isinstance(term.coefficient, Tensor):
+        if isinstance(getattr(term, "coefficient", None), Tensor):
             yield term.coefficient, by[:, 13].sum() / term.coefficient.detach()
     yield state.pos, total[:, :3]
     yield state.vel, total[:, 3:6]
@@ -172,13 +170,13 @@ def _of_body(
     yield state.pos, along
     if rest.active(taken):
         problem = _with_constant_contacts(problem, taken)
-        value = (against * force(rest, problem, _apart_from(state.pos))).sum()
+        value = (against * force_of(rest, problem, _apart_from(state.pos))).sum()
         yield value, torch.ones_like(value)
 
 
-def _reads_contact(term: Energy, taken: StepProblem) -> bool:
-    own = term.role in (Role.CONTACT, Role.FRICTION, Role.SELF_FRICTION)
-    return own or term.needs_internal_force(taken)
+def _reads_contact(term: Term, taken: StepProblem) -> bool:
+    asks = getattr(term, "needs_internal_force", None)
+    return role_of(term) in (Role.CONTACT, Role.FRICTION, Role.SELF_FRICTION) or (asks is not None and asks(taken))
 
 
 def _with_constant_contacts(problem: StepProblem, taken: StepProblem) -> StepProblem:
@@ -195,7 +193,7 @@ def with_contacts(potential: Potential, problem: StepProblem, taken: StepProblem
     internal = potential.asked_internal(problem)
     if internal is None:
         return problem
-    return replace(problem, internal_force=-force(internal, problem, _apart_from(problem.state.pos)))
+    return replace(problem, internal_force=-force_of(internal, problem, _apart_from(problem.state.pos)))
 
 
 def _apart_from(pos: Tensor) -> Tensor:
@@ -203,7 +201,7 @@ def _apart_from(pos: Tensor) -> Tensor:
     return pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
 
 
-def force(potential: Potential, problem: StepProblem, pos: Tensor) -> Tensor:
+def force_of(potential: Potential, problem: StepProblem, pos: Tensor) -> Tensor:
     """∂Φ/∂x [N] (V, 3) at ``pos`` (V, 3), as a function that autograd follows."""
     at = pos if pos.requires_grad else pos.detach().requires_grad_()
     single, rest = split(potential)
@@ -247,7 +245,7 @@ class Hessian:
     def __call__(self, x: Tensor) -> Tensor:
         direction, total = compiled_elements.as_double(x), torch.bmm(self._blocks, x.unsqueeze(2)).squeeze(2)
         for kind in self._own:
-            along = compiled_elements.along_membrane if kind is Stretching else compiled_elements.along_bending
+            along = compiled_elements.along_membrane if kind == "Stretching" else compiled_elements.along_bending
             along(self._taken.cloth, self._pos, direction, total.numpy())
         if self._rest is not None and self._rest.requires_grad:
             total = total + torch.autograd.grad(self._rest, self._at, x, retain_graph=True)[0]
@@ -300,7 +298,7 @@ class Preconditioner:
 
 
 def _compiled(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor) -> CompiledSystem | None:
-    """The compiled solver with the Hessian at ``pos`` (V, 3); None where it does not take the problem, or there is no compiler."""
+    """The compiled solver with the Hessian at ``pos`` (V, 3); None where it does not take the problem or was not compiled."""
     if not newton.applies(potential, problem):
         return None
     try:

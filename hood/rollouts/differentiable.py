@@ -5,8 +5,9 @@ fabric, rest shape, state at t, body, targets of pins, gravity, constants of the
 
     dx/dp = −H⁻¹ ∂²Φ/∂x∂p,  H = ∂²Φ/∂x²,
 
-and a loss L(x) is differentiated by one linear system: H λ = ∂L/∂x, ∂L/∂p = −λ · ∂²Φ/∂x∂p. H is the Hessian itself, by
-autograd; the matrix of the solver, which has the bending by Gauss-Newton, is the preconditioner.
+and a loss L(x) is differentiated by one linear system: H λ = ∂L/∂x, ∂L/∂p = −λ · ∂²Φ/∂x∂p. H is the Hessian itself; both are
+made by :mod:`hood.rollouts.adjoint`, written out in C++ for the default energies on a constant body. Layers that touch,
+attachments, air, damping, a body that is differentiated and own energies go through autograd, which is slower.
 
 The minimum is the solver's, bit for bit. What is kept of a step are its state and its contacts; everything else is computed
 again backwards. Which points of the body are nearest, and which side of a fold counts, is constant in the derivative, as it is
@@ -46,32 +47,31 @@ _TOLERANCE, _MOST_PRODUCTS = 1e-9, 200
 def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
     """The state at t + 1: the solver's, differentiable by every tensor of ``problem`` that requires a gradient.
 
-        Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
-        and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
-        tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
-        the minimum nearby.
+    Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
+    and velocities at t, ``gravity``, targets of pins, the body's positions, and constants of the potential's terms that are
+    tensors, such as ``Friction(coefficient)``. Of a step that was not taken to its minimum, the derivative is that of
+    the minimum nearby.
 
-        Raises:
-            ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
+    Raises:
+        ValueError: a tensor is not float64, contact is at edges or faces, or cloth keeps held vertices from their targets.
 
-        Examples:
-            >>> import numpy as np, torch, hood
-            >>> from hood.cloth.cloth import build_cloth, with_values
-            >>> from hood.cloth.state import State, StepInput
-            >>> from hood.energies.problem import StepProblem
-    from hood.energies.self_contact import without_layers
-            >>> from hood.steppers.newton import NewtonStepper
-            >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
-            >>> held = np.array([True, True, False, False])
-            >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
-            >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
-            >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
-            >>> state = State(torch.as_tensor(pos), still, origin)
-            >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
-            >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
-            >>> after.pos[3, 1].backward()
-            >>> bool(mu.grad > 0)  # harder cloth hangs higher
-            True
+    Examples:
+        >>> import numpy as np, torch, hood
+        >>> from hood.cloth.cloth import build_cloth, with_values
+        >>> from hood.cloth.state import State, StepInput
+        >>> from hood.energies.problem import StepProblem
+        >>> from hood.steppers.newton import NewtonStepper
+        >>> pos, faces = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.1, 0], [0.1, -0.1, 0]]), np.array([[0, 2, 1], [1, 2, 3]])
+        >>> held = np.array([True, True, False, False])
+        >>> mu = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+        >>> cloth = with_values(build_cloth(pos, faces, hood.Material(), held, dtype=torch.float64), lame_mu=mu)
+        >>> still, origin = (torch.zeros(rows, 3, dtype=torch.float64) for rows in (4, 1))
+        >>> state = State(torch.as_tensor(pos), still, origin)
+        >>> step = StepInput(torch.full((1,), 1 / 30, dtype=torch.float64))
+        >>> after = differentiable_step(NewtonStepper(hood.default_potential()), StepProblem(cloth, state, step))
+        >>> after.pos[3, 1].backward()
+        >>> bool(mu.grad > 0)  # harder cloth hangs higher
+        True
     """
     given = _given(problem, stepper.potential)
     wrong = next((tensor for tensor in given if tensor.dtype != torch.float64), None)

@@ -93,6 +93,7 @@ RUN = (
     ),
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
+    Run(r"gradients\.py", "--garments tank --steps 2 --rounds 1 --memory-steps 2", r"tank +1016 +\d"),
     Run(r"preconditioners\.py$", "--frames 7", r"tank +\d.*×", (r"$", " tank")),
     Run(r"preconditioners\.py dress", "", "", (r"dress.*", "tank --frames 7")),
     Run(r"sew_variants\.py", "--count 1 --designs tank --edge 0.06", r"1 of 1 garments in"),

@@ -20,6 +20,7 @@ from hood.energies.potential import Potential, default_potential, with_soft_pins
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier, LayerFriction, _followed_pressing, _pairs, _pressing, nearest_weights
 from hood.energies.wind import Wind
+from hood.rollouts import adjoint
 from hood.rollouts.differentiable import differentiable_step
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper, implicit_euler
@@ -176,6 +177,44 @@ def test_a_sheet_on_a_moving_ball_by_friction_and_by_the_ball() -> None:
         return weigh(frames(potential, cloth, at_rest(pos), steps, down(number(9.81))), pos)
 
     check(loss, usual, allowed=1e-4, change=1e-6)
+
+
+def test_the_written_out_derivatives_are_those_of_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a fabric with a warp, its mass and friction, by positions, velocities and gravity, on a body with a fold beside it."""
+    ball = trimesh.creation.icosphere(2, 0.15)
+    one, triangles = torch.tensor(np.array(ball.vertices)), torch.tensor(np.array(ball.faces), dtype=torch.int64)
+    points = torch.cat([one, one + torch.tensor([0.0, 0.0, 0.304], dtype=REAL)])
+    points += 1e-3 * torch.sin(torch.arange(points.numel(), dtype=REAL)).reshape(-1, 3)
+    faces = torch.cat([triangles, triangles + len(one)])
+    pos, mesh = sheet(6, 0.04)
+    pos = pos[:, [0, 2, 1]] + np.array([-0.09, 0.0, 0.152])  # upright, between both
+    base = build_cloth(pos, mesh, hood.Material(warp=2.0, shear=0.5), dtype=REAL)
+    start = pos + np.random.default_rng(1).normal(0.0, 1e-3, pos.shape)  # at rest the cloth around pulls nothing, to rounding
+    none = torch.zeros(len(points), dtype=torch.int64)
+    way = torch.tensor([0.002, 0.004, 0.001], dtype=REAL)
+    obstacle = Obstacle(points, points + way, points - way, faces, none, torch.zeros_like(faces[:, 0]), none > 0)
+    step = StepInput(torch.full((1,), 1.0 / 30.0, dtype=REAL), obstacle)
+
+    def derivatives() -> dict[str, Tensor]:
+        given = {name: getattr(base, name).clone() for name in ("mass", "friction", "lame_mu", "rest_inverse", "rest_angle")}
+        given |= {"pos": torch.as_tensor(start), "vel": torch.zeros_like(base.rest_pos), "gravity": down(number(9.81))}
+        given |= {"bending_stiffness": base.bending_stiffness.clone(), "coefficient": number(0.5)}
+        given = {name: value.clone().requires_grad_() for name, value in given.items()}
+        cloth = replace(base, **{name: value for name, value in given.items() if hasattr(base, name)})
+        state = State(given["pos"], given["vel"], torch.zeros(1, 3, dtype=REAL))
+        potential = default_potential().with_terms(friction=Friction(given["coefficient"]))  # type: ignore[arg-type]
+        states = list(frames(potential, cloth, state, [step] * 2, given["gravity"]))
+        weigh(iter(states), pos).backward()
+        return {name: value.grad for name, value in given.items() if value.grad is not None}
+
+    compiled = derivatives()
+    assert len(compiled) == 10
+    monkeypatch.setattr(adjoint, "_written_out", lambda potential, taken: ([], potential))
+    monkeypatch.setattr(adjoint, "_followed", lambda potential, problem, taken: {})
+    monkeypatch.setattr(adjoint, "_compiled", lambda *given: None)
+    for name, expected in derivatives().items():
+        assert bool(expected.any()), name
+        torch.testing.assert_close(compiled[name], expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()), msg=name)
 
 
 def two_sheets() -> tuple[np.ndarray, Cloth]:

@@ -336,7 +336,7 @@ def moved(start: np.ndarray, end: np.ndarray) -> tuple[float, float] | None:
 
 
 @torch.no_grad()
-def skin(vertices: Tensor, faces: Tensor, incidence: Sequence[Tensor], curved: bool) -> tuple[Tensor, Tensor] | None:
+def vertex_skin(vertices: Tensor, faces: Tensor, incidence: Sequence[Tensor], curved: bool) -> tuple[Tensor, Tensor] | None:
     """Unit normals (W, 3) and curvatures [1/m] (W,) of a surface at its vertices (W, 3), on a CPU, as
     :mod:`hood.mesh.geometry` has them; curvatures of 0 unless it is to be ``curved``. None without a compiler.
 

@@ -202,16 +202,16 @@ class CompiledScene:
         self._lib.newton_matrix(self._address, indefinite_share)
 
     def exact(self) -> None:
-        """The matrix becomes the Hessian at a state whose model has been made; of layers of cloth, of the published code's bending
-        and of terms of other classes it has what the model has."""
+        """The matrix becomes the Hessian at a state whose model has been made; of layers of cloth, of the published code's
+        bending and of terms of other classes it has what the model has."""
         memory = self._memory[self.wide, self.values.parts]
         if "curvature" not in memory:
             memory["curvature"] = np.empty((self.values.num_hinges, 90), memory["matrix"].dtype)
         self._lib.newton_exact(self._address, memory["curvature"].ctypes.data)
 
     def solve(self, right: np.ndarray, tolerance: float, cg_iterations: int, found: np.ndarray) -> bool:
-        """Write the solution of matrix x = ``right`` (V, 3) into ``found`` (V, 3), at this scene's free vertices; whether the matrix
-        was positive definite as far as was seen."""
+        """Write the solution of matrix x = ``right`` (V, 3) into ``found`` (V, 3), at this scene's free vertices; whether the
+        matrix was positive definite as far as was seen."""
         return bool(self._lib.newton_solve(self._address, right.ctypes.data, tolerance, cg_iterations, found.ctypes.data))
 
     def move(self, tolerance: float, cg_iterations: int) -> bool:

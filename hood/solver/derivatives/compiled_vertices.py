@@ -276,11 +276,12 @@ class FollowedBody:
             self._take(self._values.second, problem.second_contact.contact)
 
     def along(self, term: Collision | Friction, direction: Tensor) -> Tensor:
-        """How the term's force along ``direction`` (V, 3) [m] changes, (V, 16) of every vertex: with its position at t (3) and its
-        velocity (3), with the force of the cloth around (3), its mass, its factor of friction, its mean square of the edges and
-        their growth; then what it is."""
-        both = (term.coefficient, term.slip_speed) if isinstance(term, Friction) else (0.0, 0.0)
-        own = _FollowedTerm(term.weight, term.epsilon, term.reach == "curvature", *map(float, both))
+        """How the term's force along ``direction`` (V, 3) [m] changes, (V, 16) of every vertex: with its position at t (3) and
+        its velocity (3), with the force of the cloth around (3), its mass, its factor of friction, its mean square of the edges
+        and their growth; then what it is."""
+        both = (getattr(term, name, 0.0) for name in ("coefficient", "slip_speed"))  # contact has none
+        numbers = (value.detach() if isinstance(value, Tensor) else value for value in both)
+        own = _FollowedTerm(term.weight, term.epsilon, term.reach == "curvature", *map(float, numbers))
         found = direction.new_zeros(len(direction), 16)
         lib = library()
         assert lib is not None

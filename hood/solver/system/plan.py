@@ -137,9 +137,9 @@ class ModelBuilder:
         terms, plan = self.terms, self.plan
         vertices = terms.vertex_model(pos, acc)
         gradient = vertices.gradient
-        self._vertices.copy_(vertices.matrix.view(-1))
+        self._vertices.copy_(vertices.matrix.reshape(-1))
         if vertices.indefinite_part is not None:
-            self._vertex_slack.copy_(vertices.indefinite_part.view(-1))
+            self._vertex_slack.copy_(vertices.indefinite_part.reshape(-1))
         faces = terms.faces(pos, out=self._faces.view(45, -1))
         if faces is not None:
             gradient = gradient + plan.face_vertices(faces.gradient).view(-1, 3)
