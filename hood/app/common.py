@@ -330,3 +330,13 @@ def require_device(config: Settings) -> None:
     if processes > gpus:
         raise ConfigError(f"device=cuda: {processes} processes and {gpus} GPU{'s' * (gpus > 1)} here; --nproc-per-node {gpus}")
     torch.cuda.set_device(distributed.local_rank())
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
+    parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
+    for length in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-length:]) for part in parts]
+        if len(set(names)) == len(set(parts)):
+            break
+    return names

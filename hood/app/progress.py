@@ -32,11 +32,7 @@ from hood.rollouts.file.reader import alarms_in
 from hood.rollouts.file.recorder import Done
 from hood.rollouts.frame import Ease, Frame
 from hood.scene.scene import Scene
-from hood.steppers.network import NetworkStepper
-from hood.steppers.newton import NewtonStepper, Stepper
-from hood.steppers.refined import GuessStepper, RefinedStepper
-from hood.steppers.static_shapes.newton import CapturedNewton
-from hood.steppers.static_shapes.simulator import CapturedSimulator
+from hood.steppers.newton import Stepper, remembers
 
 #: From one write to the next it takes so many times as long as a write, at least: long frames are kept one by one.
 _APART = 20.0
@@ -55,14 +51,6 @@ class RolloutProgress:
     warnings: Sequence[str] = ()
 
 
-def remembers(stepper: Stepper) -> bool:
-    """Whether a stepper remembers more from step to step than :class:`RolloutProgress` keeps: those of a plan with parts left
-    out do, and nothing is known of those of other packages."""
-    if type(stepper) is RefinedStepper:
-        return not stepper.is_plain or remembers(stepper.inner)
-    return type(stepper) not in (NewtonStepper, NetworkStepper, GuessStepper, CapturedSimulator, CapturedNewton)
-
-
 class ProgressFile:
     """``rollout.state`` in the folder of a rollout that runs: written after every frame, or every few of short ones, and where
     the rollout ends too early.
@@ -72,7 +60,8 @@ class ProgressFile:
     Args:
         folder: of the rollout.
         scene: what it simulates.
-        stepper: what takes its steps; of one that :func:`remembers` more than there is to keep, nothing is written.
+        stepper: what takes its steps; of one that remembers more than there is to keep, nothing is written
+            (:func:`hood.steppers.newton.remembers`).
     """
 
     def __init__(self, folder: Path, scene: Scene, stepper: Stepper) -> None:
@@ -141,7 +130,7 @@ def find_progress(folder: Path, config: RolloutSettings, digest: str, scene: Sce
 
 def memories(guard: Guard | None, stepper: Stepper) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """What guard and goal know, for :class:`RolloutProgress`."""
-    return ({} if guard is None else guard.memory), (stepper.learned if isinstance(stepper, RefinedStepper) else {})
+    return ({} if guard is None else guard.memory), getattr(stepper, "learned", {})
 
 
 def recall(found: RolloutProgress, folder: Path, guard: Guard | None) -> None:

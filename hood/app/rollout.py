@@ -40,11 +40,10 @@ from hood.app.output.export import (
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
-from hood.app.progress import ProgressFile, RolloutProgress, find_progress, memories, recall, remembers
+from hood.app.progress import ProgressFile, RolloutProgress, find_progress, memories, recall
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
 from hood.app.scene.fabrics import fabric_names
-from hood.app.scene.garments import describe_ease, summarise_ease
-from hood.app.scene.motion import describe_pins, summarise_pins
+from hood.app.scene.garments import describe_ease, describe_pins, summarise_ease, summarise_pins
 from hood.app.settings.compose import plain
 from hood.app.settings.record import save_run_record
 from hood.app.settings.rollout_settings import RolloutSettings, measurement
@@ -62,7 +61,7 @@ from hood.rollouts.frame import Ease, Frame, measure_ease, metric_names
 from hood.rollouts.frames import ridden_faces, ridden_frames, ridden_rest, ridden_still, riding_attributes, still_needed
 from hood.rollouts.loop import simulate
 from hood.scene.sizing import Sizes
-from hood.steppers.newton import Stepper
+from hood.steppers.newton import Stepper, remembers
 from hood.steppers.static_shapes.simulator import network_of
 from hood.training import distributed
 

@@ -17,8 +17,17 @@ from hood.app.plan_file import plan_path, read_watch
 from hood.app.scene.events import checked_events, with_events
 from hood.app.scene.fabrics import checked_fabrics, fabric_of
 from hood.app.scene.garment_files import wanted_of
-from hood.app.scene.garments import checked_sizes, cut_to_size, heed, layer_order, names_of, names_of_own, read_outfit
-from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction, with_pins
+from hood.app.scene.garments import (
+    checked_sizes,
+    cut_to_size,
+    heed,
+    layer_order,
+    names_of,
+    names_of_own,
+    read_outfit,
+    with_pins,
+)
+from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
 from hood.app.settings.compose import ConfigError, brief, require_choice
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes, measurement
 from hood.app.stepping.automatic import Choice, choose, decided

@@ -17,9 +17,8 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from hood.app.common import held_folder, output_folder, require_package, split_words, thinning
+from hood.app.common import held_folder, output_folder, require_package, short_names, split_words, thinning
 from hood.app.output.export import lay_on, read_checked, read_textures
-from hood.app.output.view import short_names
 from hood.app.settings.compose import ConfigError, require_choice, shown
 from hood.app.settings.record import read_record, read_words
 from hood.app.sweep import REASON, state_of

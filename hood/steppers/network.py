@@ -92,6 +92,7 @@ class NetworkStepper(nn.Module):
     gravity: Tensor
     times: tuple[str, ...] = ("search", "features", "network", "rest", "total")
     metrics: tuple[str, ...] = ()
+    memoryless = True
 
     def __init__(
         self,

@@ -79,7 +79,8 @@ class Stepper(Protocol):
     :class:`hood.steppers.network.NetworkStepper` that takes its steps; ``solves_to``, the
     :class:`hood.solver.newton.NewtonSettings` that every step is to meet; ``any_precision`` where it computes in the precision
     of the state, whatever that of its gravity is; ``num_coarse``, the coarse levels that it takes as a third argument of
-    ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes.
+    ``prepare``; ``in_fixed_shapes(mode)``, the same steps by functions of fixed shapes; ``memoryless``, true in a class whose
+    steps depend on nothing that was before but what a rollout keeps (:func:`remembers`).
     """
 
     gravity: Tensor  # (3,) m/s²
@@ -123,6 +124,14 @@ def require_stepper(given: object) -> None:
         )
 
 
+def remembers(stepper: Stepper) -> bool:
+    """Whether a stepper remembers more from step to step than its state and what its goal has learned.
+
+    It does unless its own class says that it is ``memoryless``; classes that inherit from it have to say so again.
+    """
+    return "memoryless" not in vars(type(stepper)) or not stepper.memoryless  # type: ignore[attr-defined]
+
+
 class NewtonStepper:
     """Implicit Euler by projected Newton on the same potential that trains the networks; no weights.
 
@@ -134,6 +143,7 @@ class NewtonStepper:
     times: tuple[str, ...] = ("search", "solver", "rest", "total")
     metrics: tuple[str, ...] = ("solver_iterations", "solver_converged", "solver_reason")
     relaxing = Relaxing.SETTLE
+    memoryless = True
 
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()

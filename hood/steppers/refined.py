@@ -23,7 +23,7 @@ from hood.solver.system.iterate import Progress, in_single, rounded
 from hood.solver.system.plan import plan_for
 from hood.solver.vertex.gauss_seidel import colours_of, sweep
 from hood.steppers.network import Prediction
-from hood.steppers.newton import Stepper
+from hood.steppers.newton import Stepper, remembers
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
 from hood.steppers.stopping import RefinementState, StoppingCriterion
 from hood.tensors.batch import to_device
@@ -42,6 +42,7 @@ class GuessStepper:
     metrics: tuple[str, ...] = ()
     relaxing = Relaxing.SETTLE
     any_precision = True
+    memoryless = True
 
     def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
         self.potential, self.settings = potential, settings or NewtonSettings()
@@ -136,9 +137,10 @@ class RefinedStepper:
         self.goal = deepcopy(self._fresh_goal)
 
     @property
-    def is_plain(self) -> bool:
-        """Whether beside its inner stepper it remembers what its goal has learned alone."""
-        return self._minimizer is None and type(self.goal).__module__ == StoppingCriterion.__module__
+    def memoryless(self) -> bool:
+        """Whether it remembers what its goal has learned alone."""
+        plain = self._minimizer is None and type(self.goal).__module__ == StoppingCriterion.__module__
+        return plain and not remembers(self.inner)
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from hood.app.output.view import short_names
+from hood.app.common import short_names
 from hood.cli.help import describe
 from hood.cli.main import main
 from hood.rollouts.file.recorder import RolloutWriter

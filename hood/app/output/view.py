@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from hood.app.common import frame_count, output_folder, split_words
+from hood.app.common import frame_count, output_folder, short_names, split_words
 from hood.app.output.export import lay_on, read_checked, read_textures
 from hood.app.settings.compose import ConfigError
 from hood.assets.files.atomic import write_atomically
@@ -86,13 +86,3 @@ def _first_frames(data: RolloutData, count: int | None) -> RolloutData:
     return replace(
         data, cloth_pos=data.cloth_pos[:count], body_pos=data.body_pos[:count], time=data.time[:count], metrics=metrics
     )
-
-
-def short_names(paths: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that tell them apart, ``rollout.h5`` left out."""
-    parts = [path.absolute().parent.parts + (() if path.name == "rollout.h5" else (path.stem,)) for path in paths]
-    for length in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(part[-length:]) for part in parts]
-        if len(set(names)) == len(set(parts)):
-            break
-    return names

@@ -1,6 +1,6 @@
 """Reading the garments that a command is given: one or several, repaired or not, with their pins.
 
-``size=``, ``fit=`` and how the garment sits: keys of a rollout, and what its summary says.
+``size=``, ``fit=`` and how the garment sits, ``pins=`` and what they follow: keys of a rollout, and what its summary says.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from hood.assets.fitting.suspicions import Suspicion, suspect_kind, suspect_seam
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.outfit import join_garments
 from hood.assets.garment.parts import elasticated, tailored
-from hood.assets.garment.pins import Pins, pin_mask
+from hood.assets.garment.pins import Pins, pin_groups, pin_mask
 from hood.assets.garment.record import Wanted
 from hood.mesh.editing.repair import FLAT
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.frame import Ease
 from hood.scene.body_motion.motion import BodyMotion, Motion
+from hood.scene.following import held_by, stiffness_of
+from hood.scene.scene import Scene
 from hood.scene.sizing import Sizes, sizes_of
 
 
@@ -287,3 +290,66 @@ def describe_ease(summary: Mapping[str, Any]) -> list[str]:
         stretched = f"stretched by {100 * ease['stretch']:.1f}% there; upper rim {100 * ease['slid']:.0f} cm down"
         words.append(f"{when}: {ease['word']} ({skin}, {stretched})")
     return ["size, " + "; ".join(words)]
+
+
+def with_pins(scene: Scene, config: Settings) -> Scene:
+    """The scene whose pins follow what the config says, some of them by springs; the same where it says nothing of that.
+
+    Raises:
+        ValueError: there is no body to follow, no such part of it, or none near.
+    """
+    pins = plain(config.pins)
+    if pins is None:
+        return scene
+    body = scene.motion.body if isinstance(scene.motion, BodyMotion) else None
+    return replace(scene, held=held_by(pin_groups(pins, scene.garment, body), scene.motion, scene.garment))
+
+
+def summarise_pins(scene: Scene, data: RolloutData) -> dict[str, Any]:
+    """Of every group of pins that follow something or are springs: how many vertices, how many of them by springs of which
+    constants, what they follow, and how far [m] they were from there at most. Nothing of other scenes."""
+    if scene.held is None:
+        return {}
+    rows = []
+    for group in scene.held.groups:
+        soft = stiffness_of(group.weights[~group.exact])
+        rows.append(
+            {
+                "vertices": len(group.vertices),
+                "soft": len(soft),
+                "stiffness_N_per_m": [float(soft.min()), float(soft.max())] if len(soft) else None,
+                "follows": group.whom,
+                "off_max_m": _farthest(scene, data, group.vertices[group.exact]),
+                "off_soft_max_m": _farthest(scene, data, group.vertices[~group.exact]),
+            }
+        )
+    return {"pins": rows}
+
+
+def _farthest(scene: Scene, data: RolloutData, vertices: np.ndarray) -> float | None:
+    """How far [m] vertices (P,) were from where pins hold them in a frame, at most; None of none, or where some are let go."""
+    if not len(vertices) or scene.holding is not None:
+        return None
+    worst, motion = 0.0, scene.motion
+    for frame, pos in enumerate(data.step_pos(vertices)):
+        origin = motion.translation[frame]
+        there = scene.skinned(frame, origin).cpu().double().numpy()[vertices] + origin
+        worst = max(worst, float(np.linalg.norm(pos - there, axis=1).max()))
+    return worst
+
+
+def describe_pins(summary: Mapping[str, Any]) -> list[str]:
+    """A line on every group of pins."""
+    lines = []
+    for row in summary.get("pins", []):
+        exact, soft = row["vertices"] - row["soft"], row["soft"]
+        low, high = row["stiffness_N_per_m"] or (0.0, 0.0)
+        springs = f"by springs of {low:.3g}{'' if low == high else f' to {high:.3g}'} N/m"
+        said = [f"{exact} vertices are held" + _off_by(row["off_max_m"])] if exact else []
+        said += [f"{soft} {springs}" + _off_by(row["off_soft_max_m"])] if soft else []
+        lines.append(f"pins: {', '.join(said) or 'none'}; they follow {row['follows']}")
+    return lines
+
+
+def _off_by(metres: float | None) -> str:
+    return "" if metres is None else f", at most {1e3 * metres:.2f} mm off"

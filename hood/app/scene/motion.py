@@ -1,12 +1,12 @@
 """Reading the body and motion that a command is given.
 
-``body_friction=``: parts of the body that grip the cloth more or less than the rest. ``pins=``: what of it pins follow.
+``body_friction=``: parts of the body that grip the cloth more or less than the rest.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import getitem
@@ -21,18 +21,16 @@ from hood.app.settings.rollout_settings import Settings, objects
 from hood.assets.body.body import Body
 from hood.assets.files.library import names
 from hood.assets.garment.garment import Garment
-from hood.assets.garment.pins import pin_groups
 from hood.assets.motion.animated_mesh import BodyMesh, body_kind
 from hood.assets.motion.load import HANDS
 from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.skeleton import TRANSLATION_UNITS
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
-from hood.scene.body_motion.motion import BodyMotion, Motion
-from hood.scene.following import held_by, part_of, stiffness_of
+from hood.scene.body_motion.motion import Motion
+from hood.scene.following import part_of
 
 if TYPE_CHECKING:
     from hood.assets.material import Material
-    from hood.rollouts.file.reader import RolloutData
     from hood.scene.scene import Scene
 
 
@@ -91,69 +89,6 @@ def with_body_friction(scene: Scene, config: Settings) -> Scene:
         except ValueError as error:
             raise ValueError(f"body_friction: {error}") from error
     return replace(scene, friction_scale=torch.as_tensor(grip))
-
-
-def with_pins(scene: Scene, config: Settings) -> Scene:
-    """The scene whose pins follow what the config says, some of them by springs; the same where it says nothing of that.
-
-    Raises:
-        ValueError: there is no body to follow, no such part of it, or none near.
-    """
-    pins = plain(config.pins)
-    if pins is None:
-        return scene
-    body = scene.motion.body if isinstance(scene.motion, BodyMotion) else None
-    return replace(scene, held=held_by(pin_groups(pins, scene.garment, body), scene.motion, scene.garment))
-
-
-def summarise_pins(scene: Scene, data: RolloutData) -> dict[str, Any]:
-    """Of every group of pins that follow something or are springs: how many vertices, how many of them by springs of which
-    constants, what they follow, and how far [m] they were from there at most. Nothing of other scenes."""
-    if scene.held is None:
-        return {}
-    rows = []
-    for group in scene.held.groups:
-        soft = stiffness_of(group.weights[~group.exact])
-        rows.append(
-            {
-                "vertices": len(group.vertices),
-                "soft": len(soft),
-                "stiffness_N_per_m": [float(soft.min()), float(soft.max())] if len(soft) else None,
-                "follows": group.whom,
-                "off_max_m": _farthest(scene, data, group.vertices[group.exact]),
-                "off_soft_max_m": _farthest(scene, data, group.vertices[~group.exact]),
-            }
-        )
-    return {"pins": rows}
-
-
-def _farthest(scene: Scene, data: RolloutData, vertices: np.ndarray) -> float | None:
-    """How far [m] vertices (P,) were from where pins hold them in a frame, at most; None of none, or where some are let go."""
-    if not len(vertices) or scene.holding is not None:
-        return None
-    worst, motion = 0.0, scene.motion
-    for frame, pos in enumerate(data.step_pos(vertices)):
-        origin = motion.translation[frame]
-        there = scene.skinned(frame, origin).cpu().double().numpy()[vertices] + origin
-        worst = max(worst, float(np.linalg.norm(pos - there, axis=1).max()))
-    return worst
-
-
-def describe_pins(summary: Mapping[str, Any]) -> list[str]:
-    """A line on every group of pins."""
-    lines = []
-    for row in summary.get("pins", []):
-        exact, soft = row["vertices"] - row["soft"], row["soft"]
-        low, high = row["stiffness_N_per_m"] or (0.0, 0.0)
-        springs = f"by springs of {low:.3g}{'' if low == high else f' to {high:.3g}'} N/m"
-        said = [f"{exact} vertices are held" + _off_by(row["off_max_m"])] if exact else []
-        said += [f"{soft} {springs}" + _off_by(row["off_soft_max_m"])] if soft else []
-        lines.append(f"pins: {', '.join(said) or 'none'}; they follow {row['follows']}")
-    return lines
-
-
-def _off_by(metres: float | None) -> str:
-    return "" if metres is None else f", at most {1e3 * metres:.2f} mm off"
 
 
 #: Values of the keys that take numbers.

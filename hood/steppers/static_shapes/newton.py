@@ -57,6 +57,7 @@ class CapturedNewton:
 
     times: tuple[str, ...] = ("solver", "rest", "total")
     relaxing = Relaxing.SETTLE
+    memoryless = True
 
     def __init__(self, stepper: NewtonStepper, mode: str = "captured") -> None:
         if mode not in _MODES:

@@ -192,6 +192,7 @@ class CapturedSimulator:
     """
 
     times: tuple[str, ...] = ("step", "rest", "total")
+    memoryless = True
 
     def __init__(
         self, simulator: NetworkStepper, mode: str = "captured", capacity: Capacity | None = None, or_plain: bool = False
