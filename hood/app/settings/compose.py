@@ -29,7 +29,7 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 #: Keys that take a table of parts, some beside numbers and lists.
-TABLES = tuple("size size_end fabrics refine metrics cloth_contact objects trainer.optimizer trainer.schedule".split())
+TABLES = tuple("size size_end fabrics refine metrics cloth_contact objects guess bounds priors trainer.optimizer trainer.schedule".split())
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself; and those that are "auto", or a value of another kind that their reader checks.
