@@ -1,7 +1,7 @@
 """``hood fit``: fabric, size, friction and wind from frames that were seen.
 
 The frames are simulated again and again with other values, until they lie on the observed ones
-(:mod:`hood.evaluation.least_squares`).
+(:mod:`hood.evaluation.fitting`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from hood.app.common import output_folder, prepare_folder
@@ -27,10 +26,8 @@ from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import unheard
-from hood.assets.formats.vertex_files import read_points_folder
-from hood.evaluation.least_squares import Minimum, Unknown, estimates, search, seen_ratios
-from hood.mesh.closest_point.search import search_surface
-from hood.rollouts.file.reader import RolloutData, read_rollout
+from hood.evaluation.fitting import Minimum, Observed, Unknown, estimates, observed_frames, search, seen_ratios
+from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import still_of
 from hood.rollouts.loop import simulate
 
@@ -68,72 +65,6 @@ _SHEET = 5
 
 
 @dataclass(frozen=True)
-class Observed:
-    """What was seen.
-
-    Args:
-        frames: (P, 3) m, each; vertices of the garment, rows of NaN where one was not seen, or with ``points`` any points.
-        points: whether they belong to no vertices.
-    """
-
-    frames: Sequence[np.ndarray]
-    points: bool
-
-    def apart(self, number: int, cloth: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """(N, 3) m, from what was seen in a frame to the cloth (V, 3): to the vertex, or the nearest point of the surface."""
-        seen = self.frames[number]
-        if not self.points:
-            return (cloth - seen)[np.isfinite(seen).all(axis=1)]
-        there, vertices, tri = torch.as_tensor(seen), torch.as_tensor(cloth), torch.as_tensor(faces)
-        none = [torch.zeros(len(rows), dtype=torch.int64) for rows in (there, vertices, tri)]
-        hit = search_surface(there, none[0], vertices, tri, none[1], none[2])
-        return ((vertices[tri[hit.face]] * hit.bary.unsqueeze(2)).sum(dim=1) - there).numpy()
-
-    def drawn(self, beside: RolloutData) -> RolloutData:
-        """As a rollout in the place of another one; a point is drawn as a triangle of 8 mm."""
-        if not self.points:
-            return replace(beside, cloth_pos=np.where(np.isnan(self.frames), beside.cloth_pos, self.frames))
-        count = max(map(len, self.frames))
-        corners = 4e-3 * np.array([[-1.0, -0.6, 0.4], [1.0, -0.6, -0.4], [0.0, 1.1, 0.0]])
-        pos = np.stack([(np.resize(seen, (count, 3))[:, None] + corners).reshape(-1, 3) for seen in self.frames])
-        return replace(beside, cloth_pos=pos, cloth_faces=np.arange(3 * count).reshape(-1, 3), rest_pos=pos[0], still={})
-
-
-def observed_frames(given: Any, points: bool, most: int) -> Observed:
-    """What was seen, from a file, a folder or arrays; of points at most so many of a frame, evenly picked.
-
-    Raises:
-        ValueError: frames that cannot be used; names the first one.
-    """
-    if isinstance(given, str):
-        path = Path(given).expanduser()
-        if path.is_dir() and not (path / "rollout.h5").exists():
-            found: Any = read_points_folder(path)
-        else:
-            data = read_rollout(path)
-            found = data.cloth_pos[:, : data.cloth_pos.shape[1] - data.riding[0]]
-    else:
-        found = given
-    frames = [np.asarray(frame, dtype=np.float64) for frame in found]
-    if not frames:
-        raise ValueError("observed: there are no frames")
-    for number, frame in enumerate(frames):
-        if frame.ndim != 2 or frame.shape[1] != 3 or len(frame) == 0:
-            raise ValueError(f"observed: frame {number} has the shape {frame.shape}; give points (P, 3) in metres")
-        if points:
-            frames[number] = frame = frame[np.isfinite(frame).all(axis=1)]
-            frames[number] = frame[:: -(-len(frame) // most)] if len(frame) else frame
-        elif len(frame) != len(frames[0]):
-            raise ValueError(
-                f"observed: frame {number} has {len(frame)} vertices, frame 0 has {len(frames[0])}; give the same mesh in every "
-                "frame, or points=true where points belong to no vertices"
-            )
-        if not np.isfinite(frames[number]).any():
-            raise ValueError(f"observed: frame {number} holds no point that is finite; leave out the frames from there on")
-    return Observed(frames, points)
-
-
-@dataclass(frozen=True)
 class Fitted:
     """What came of a fit: the content of ``fit.json``, where it lies, and whether the user interrupted it."""
 
@@ -151,8 +82,8 @@ def fit(observed: Any = None, *, tell: Callable[[str], None] | None = None, **ke
     """Run ``hood fit`` with its keys: what cloth is made of, from frames that were seen. Nothing is printed.
 
     Args:
-        observed: a file or folder as of ``hood fit``, or the frames: (T, V, 3) m with rows of NaN where nothing was seen, or with
-            ``points=True`` a list of arrays (P, 3).
+        observed: a file or folder as of ``hood fit``, or the frames: (T, V, 3) m with rows of NaN where nothing was seen, or
+            with ``points=True`` a list of arrays (P, 3).
         tell: is called with every line that the command prints: ``tell=print``.
         keys: those of ``hood fit --help`` and ``hood rollout --help``, such as ``parameters=["lame_mu"], garment="dress"``.
 
@@ -325,8 +256,8 @@ class _Scene:
             count = len(self.observed.frames[0])
             if count != scene.cloth.num_vertices:
                 raise ConfigError(
-                    f"observed: {count} vertices a frame, the garment has {scene.cloth.num_vertices}; give the garment that was "
-                    "seen, or points=true where points belong to no vertices"
+                    f"observed: {count} vertices a frame, the garment has {scene.cloth.num_vertices}; give the garment that "
+                    "was seen, or points=true where points belong to no vertices"
                 )
 
     def _set_up(self, values: Mapping[str, float]) -> Setup:
@@ -377,9 +308,9 @@ class _Fit:
     def run(self) -> Fitted:
         now, count, interrupted = None, 0, False
         total = len(self._scene.observed.frames)
+        counts = [max(min(2, total), math.ceil(share * total)) for share in plain(self._config.windows)]
         try:
-            for share in plain(self._config.windows):
-                count = max(min(2, total), math.ceil(share * total))
+            for count in dict.fromkeys(counts):
                 for now in self._window(count):
                     self._write(self._content(now, count))
         except KeyboardInterrupt:
@@ -404,9 +335,12 @@ class _Fit:
         """The search in the first ``count`` frames; the next one begins where it ends."""
         noise = None if self._config.noise is None else float(self._config.noise)
         free = 1 if self._scene.observed.points else 3
-        steps = search(
-            lambda values: self._scene.residual(values, count), self._unknowns, noise, _LEAST_NOISE, int(self._config.most_steps), free
-        )
+        last = count == len(self._scene.observed.frames)
+
+        def residual(values: Mapping[str, float]) -> np.ndarray:
+            return self._scene.residual(values, count)
+
+        steps = search(residual, self._unknowns, noise, _LEAST_NOISE, int(self._config.most_steps), free, last)
         for step, now in enumerate(steps):
             if now.covariance is None:
                 self._history.append((count / len(self._scene.observed.frames), now.rms))

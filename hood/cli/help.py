@@ -159,7 +159,7 @@ def describe(name: str) -> str:
         lines += ["", "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …"]
         lines += ["The keys of hood train say a training; experiment=, trainer= or data.* has to be among them."]
     if name == "fit":
-        lines += ["", "All other keys are those of hood rollout and say the scene: garment, body, sequence, pins, fps, gravity, …"]
+        lines += ["", "All other keys are those of hood rollout and say the scene: garment, body, sequence, pins, fps, …"]
     if name == "dress":
         lines += ["", "All other keys are those of hood rollout, the same for all rows: stepper, num_frames, fps, metrics, …"]
     if name == "fabric":

@@ -2,8 +2,8 @@
 
 A derivative is that of the minimum, and a step stops near it. The rollout is taken a second time, its steps solved a hundred
 times further: how much the gradients differ is what the first ones are off by, to first order. That holds for the state that a
-step hands on, for the loss and for contacts that set in between the two, of which a linear estimate would know nothing; it costs
-as much as the gradients themselves.
+step hands on, for the loss and for contacts that set in between the two, of which a linear estimate would know nothing. It
+costs as much as the gradients themselves.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from hood.steppers.newton import NewtonStepper
 
 #: The second rollout goes to this share of the unbalanced force that the first one reached, and no further than the next.
 _FURTHER, _FURTHEST = 1e-2, 1e-11
-#: Times the difference: covers what the second rollout is off by itself (benchmarks/gradients.py).
-SAFETY = 1.5
+#: Times the difference: covers what the second rollout is off by itself, as where it meets a kink. The least whole number that
+#: covered 35 cases of benchmarks/gradients.py, other cases than those it is tested by.
+SAFETY = 2.0
 #: The adjoint systems are solved to about this share.
 _ROUNDING = 1e-8
 #: Gradients that are off by more than this share are warned about.
@@ -147,8 +148,8 @@ class DifferentiableFrames(Iterator[State]):
         worst = max(error, key=error.__getitem__)
         if error[worst] > _WARNED:
             warnings.warn(
-                f"gradients: that by {worst} is off by about {100 * error[worst]:.2g}%, as steps ended at an unbalanced force of "
-                f"up to {reached:.2g} of the weight; give a smaller solver.target_rg",
+                f"gradients: that by {worst} is off by about {100 * error[worst]:.2g}%, as steps ended at an unbalanced force "
+                f"of up to {reached:.2g} of the weight; give a smaller solver.target_rg",
                 stacklevel=2,
             )
         return Gradients(float(value), found, error, steps)
@@ -169,16 +170,18 @@ class DifferentiableFrames(Iterator[State]):
         def watch(potential: Potential, problem: StepProblem, pos: Tensor) -> None:
             ended.append(_ended(potential, problem, pos))
 
-        return differentiable_states(
-            stepper, self._scene, self._start, self._num_steps, self._cloth, self._gravity, watch
-        )
+        return differentiable_states(stepper, self._scene, self._start, self._num_steps, self._cloth, self._gravity, watch)
 
 
 def _ended(potential: Potential, problem: StepProblem, pos: Tensor) -> _Ended:
     acc = problem.acceleration(pos)
     there = pos.detach().requires_grad_()
     with torch.enable_grad():
-        contact = [term(problem, there, acc).sum() for term in potential.terms.values() if hasattr(term, "reach") and term.applies(problem)]
+        contact = [
+            term(problem, there, acc).sum()
+            for term in potential.terms.values()
+            if hasattr(term, "reach") and term.applies(problem)
+        ]
         force = torch.zeros_like(pos)
         if contact:
             (force,) = torch.autograd.grad(torch.stack(contact).sum(), there)

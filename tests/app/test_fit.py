@@ -30,7 +30,7 @@ def sheet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def seen(sheet: Path) -> np.ndarray:
     """(T, V, 3) m of the truth."""
-    keys = {"stepper": "newton", "metrics": "none", "solver": {"target_rg": 1e-5}, "num_frames": FRAMES}
+    keys: dict[str, Any] = {"stepper": "newton", "metrics": "none", "solver": {"target_rg": 1e-5}, "num_frames": FRAMES}
     return np.stack([frame.world_pos.numpy() for frame in hood.simulate(**scene(sheet), material=TRUTH, **keys)])
 
 
@@ -97,7 +97,9 @@ def test_size_and_wind_and_frames_that_lack_vertices(sheet: Path, tmp_path: Path
     frames = np.stack([frame.world_pos.numpy() for frame in steps])
     frames[3, 7] = np.nan
     out = str(tmp_path / "out")
-    found = hood.fit(frames, parameters=["size", "wind"], **{**scene(sheet), "wind": [0.0, 0.0, 0.0]}, windows=[1.0], output=out)
+    found = hood.fit(
+        frames, parameters=["size", "wind"], **{**scene(sheet), "wind": [0.0, 0.0, 0.0]}, windows=[1.0], output=out
+    )
     values = {name: one["value"] for name, one in found["parameters"].items()}
     assert values == pytest.approx({"size": 1.05, "wind_x": 1.0, "wind_y": 0.0, "wind_z": -2.0}, abs=0.05)
     assert values["size"] == pytest.approx(1.05, abs=2e-3)

@@ -16,7 +16,7 @@ from hood.cloth.state import State
 from hood.mesh.shapes import grid, sphere
 from hood.rollouts.gradients import DifferentiableFrames, Gradients
 
-SHEET = {"body": "none", "pins": [0, 3]}
+SHEET: dict[str, Any] = {"body": "none", "pins": [0, 3]}
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def followed(folder: Path, target: float, **scene: Any) -> tuple[DifferentiableFrames, dict[str, Tensor]]:
     of = {"lame_mu": 2e4, "bending_stiffness": 1e-4}
     given = {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in of.items()}
-    keys = {"num_frames": 5, "settle": 0, "stepper": "newton", "metrics": "none", "solver": {"target_rg": target}, "worn": False}
+    keys: dict[str, Any] = {
+        "num_frames": 5,
+        "settle": 0,
+        "stepper": "newton",
+        "metrics": "none",
+        "solver": {"target_rg": target},
+        "worn": False,
+    }
     return hood.differentiable(hood.simulate(str(folder / "sheet.obj"), **keys, **scene), **given), given
 
 

@@ -134,7 +134,9 @@ def read_points_folder(folder: Path) -> list[np.ndarray]:
     numbers = [(_number(path)[0] or [0])[-1] for path in files]
     missing = next((before + 1 for before, after in zip(numbers, numbers[1:], strict=False) if after != before + 1), None)
     if missing is not None and len(files) > 1:
-        raise ValueError(f"{folder}: there is no frame {missing} between {files[0].name} and {files[-1].name}; number them 0, 1, 2, …")
+        raise ValueError(
+            f"{folder}: there is no frame {missing} between {files[0].name} and {files[-1].name}; number them 0, 1, 2, …"
+        )
     frames = []
     for path in files:
         check_size(path, SIZE_LIMIT)

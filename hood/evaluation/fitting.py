@@ -1,4 +1,5 @@
-"""Nonlinear least squares of few unknowns within bounds and priors, and what the data tell of each of them.
+"""Parameters from observations: how far cloth is from what was seen, least squares of few unknowns within bounds and priors,
+and what the data tell of each of them.
 
 Levenberg-Marquardt (Nocedal and Wright, "Numerical Optimization", 2006, chapter 10) with a Jacobian by forward differences:
 one more evaluation an unknown, whatever an evaluation is. Intervals are those of the Gauss-Newton matrix at the minimum.
@@ -9,8 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+
+from hood.assets.formats.vertex_files import read_points_folder
+from hood.mesh.closest_point.search import search_surface
+from hood.rollouts.file.reader import RolloutData, read_rollout
 
 Residual = Callable[[Mapping[str, float]], np.ndarray]
 
@@ -90,7 +98,13 @@ class Minimum:
 
 
 def search(
-    residual: Residual, unknowns: Sequence[Unknown], noise: float | None, least_noise: float, most_steps: int, free: int = 1
+    residual: Residual,
+    unknowns: Sequence[Unknown],
+    noise: float | None,
+    least_noise: float,
+    most_steps: int,
+    free: int = 1,
+    intervals: bool = True,
 ) -> Iterator[Minimum]:
     """Steps of the search: the guess, the place after every step, and at last the minimum with its covariance.
 
@@ -100,6 +114,7 @@ def search(
         least_noise: it is no smaller.
         most_steps: the search ends after so many; then the last one has not converged.
         free: directions of a row in which it may be off: fewer than D where the others are 0 by themselves.
+        intervals: False: the last one is left out, with its two evaluations an unknown.
 
     Raises:
         ValueError: the residual at the guess is not finite, or no longer than there are unknowns.
@@ -113,7 +128,7 @@ def search(
         >>> last.converged, round(last.values["rate"], 3)
         (True, 3.0)
     """
-    return _Search(residual, list(unknowns), noise, least_noise, free).run(most_steps)
+    return _Search(residual, list(unknowns), noise, least_noise, free).run(most_steps, intervals)
 
 
 def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Estimate]:
@@ -147,6 +162,72 @@ def seen_ratios(minimum: Minimum, unknowns: Sequence[Unknown], found: Mapping[st
             if half < 0.5 * math.log(SEEN):
                 ratios[unknowns[i].name, unknowns[j].name] = math.expm1(half)
     return ratios
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was seen.
+
+    Args:
+        frames: (P, 3) m, each; vertices of the garment, rows of NaN where one was not seen, or with ``points`` any points.
+        points: whether they belong to no vertices.
+    """
+
+    frames: Sequence[np.ndarray]
+    points: bool
+
+    def apart(self, number: int, cloth: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """(N, 3) m, from what was seen in a frame to the cloth (V, 3): to the vertex, or the nearest point of the surface."""
+        seen = self.frames[number]
+        if not self.points:
+            return (cloth - seen)[np.isfinite(seen).all(axis=1)]
+        there, vertices, tri = torch.as_tensor(seen), torch.as_tensor(cloth), torch.as_tensor(faces)
+        none = [torch.zeros(len(rows), dtype=torch.int64) for rows in (there, vertices, tri)]
+        hit = search_surface(there, none[0], vertices, tri, none[1], none[2])
+        return ((vertices[tri[hit.face]] * hit.bary.unsqueeze(2)).sum(dim=1) - there).numpy()
+
+    def drawn(self, beside: RolloutData) -> RolloutData:
+        """As a rollout in the place of another one; a point is drawn as a triangle of 8 mm."""
+        if not self.points:
+            return replace(beside, cloth_pos=np.where(np.isnan(self.frames), beside.cloth_pos, self.frames))
+        count = max(map(len, self.frames))
+        corners = 4e-3 * np.array([[-1.0, -0.6, 0.4], [1.0, -0.6, -0.4], [0.0, 1.1, 0.0]])
+        pos = np.stack([(np.resize(seen, (count, 3))[:, None] + corners).reshape(-1, 3) for seen in self.frames])
+        return replace(beside, cloth_pos=pos, cloth_faces=np.arange(3 * count).reshape(-1, 3), rest_pos=pos[0], still={})
+
+
+def observed_frames(given: Any, points: bool, most: int) -> Observed:
+    """What was seen, from a file, a folder or arrays; of points at most so many of a frame, evenly picked.
+
+    Raises:
+        ValueError: frames that cannot be used; names the first one.
+    """
+    if isinstance(given, str):
+        path = Path(given).expanduser()
+        if path.is_dir() and not (path / "rollout.h5").exists():
+            found: Any = read_points_folder(path)
+        else:
+            data = read_rollout(path)
+            found = data.cloth_pos[:, : data.cloth_pos.shape[1] - data.riding[0]]
+    else:
+        found = given
+    frames = [np.asarray(frame, dtype=np.float64) for frame in found]
+    if not frames:
+        raise ValueError("observed: there are no frames")
+    for number, frame in enumerate(frames):
+        if frame.ndim != 2 or frame.shape[1] != 3 or len(frame) == 0:
+            raise ValueError(f"observed: frame {number} has the shape {frame.shape}; give points (P, 3) in metres")
+        if points:
+            frames[number] = frame = frame[np.isfinite(frame).all(axis=1)]
+            frames[number] = frame[:: -(-len(frame) // most)] if len(frame) else frame
+        elif len(frame) != len(frames[0]):
+            raise ValueError(
+                f"observed: frame {number} has {len(frame)} vertices, frame 0 has {len(frames[0])}; give the same mesh "
+                "in every frame, or points=true where points belong to no vertices"
+            )
+        if not np.isfinite(frames[number]).any():
+            raise ValueError(f"observed: frame {number} holds no point that is finite; leave out the frames from there on")
+    return Observed(frames, points)
 
 
 class _Search:
@@ -194,17 +275,18 @@ class _Search:
         cost = float(r @ r) / variance + float(self._weight @ (z - self._mean) ** 2)
         return cost if math.isfinite(cost) else math.inf
 
-    def run(self, most_steps: int) -> Iterator[Minimum]:
+    def run(self, most_steps: int, intervals: bool) -> Iterator[Minimum]:
         z = np.array([one.place(one.guess) for one in self._unknowns])
         r = self._at(z)
         if not np.isfinite(r).all():
             raise ValueError("the simulation of the guess is not finite; give another guess")
         if self._rows * self._free <= len(z):
-            raise ValueError(f"{self._rows * self._free} observed numbers cannot tell {len(z)} parameters; give more frames, or fit fewer")
+            told = f"{self._rows * self._free} observed numbers cannot tell {len(z)} parameters"
+            raise ValueError(f"{told}; give more frames, or fit fewer")
         history = [self._rms(r)]
         now = Minimum(self._values(z), history[0], self._evaluations, history=tuple(history))
         yield now
-        damping, done, step = _DAMPING, False, None
+        damping, done = _DAMPING, False
         for _ in range(most_steps):
             jacobian, variance = self._jacobian(z, r), self._variance(r)
             step, r_next, damping, done = self._step(z, r, jacobian, variance, damping)
@@ -216,8 +298,9 @@ class _Search:
             yield now
             if done:
                 break
-        jacobian = self._jacobian(z, r) if step is not None else jacobian
-        covariance = self._covariance(self._along_axes(z, r, jacobian), self._variance(r))
+        if not intervals:
+            return
+        covariance = self._covariance(self._along_axes(z, jacobian), self._variance(r))
         yield replace(now, evaluations=self._evaluations, converged=done, covariance=covariance)
 
     def _step(
@@ -254,7 +337,7 @@ class _Search:
         step[free] = -np.linalg.solve(part + damping * np.diag(np.diag(part) + 1.0), slope[free])
         return step
 
-    def _along_axes(self, z: np.ndarray, r: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    def _along_axes(self, z: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
         """The Jacobian (N, P) by central differences along the axes of the Gauss-Newton matrix. What the data do not tell is
         mostly a direction, as of unknowns that scale together: along it nothing changes, while differences in each unknown
         alone leave their truncation."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from hood.evaluation.least_squares import Minimum, Residual, Unknown, estimates, search, seen_ratios
+from hood.evaluation.fitting import Minimum, Residual, Unknown, estimates, search, seen_ratios
 
 TIMES = np.linspace(0.0, 2.0, 40)
 
