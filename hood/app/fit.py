@@ -23,10 +23,11 @@ from hood.app.settings.compose import ConfigError, load_config, named_today, pla
 from hood.app.settings.python_words import overrides
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
+from hood.app.stepping.cautions import idle_in_rollout
 from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import unheard
-from hood.evaluation.fitting import Minimum, Observed, Unknown, estimates, observed_frames, search, seen_ratios
+from hood.evaluation.fitting import Minimum, Observed, Unknown, estimates, fit_steps, observed_frames, seen_ratios
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import still_of
 from hood.rollouts.loop import simulate
@@ -128,6 +129,8 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
         observed = replace(observed, frames=observed.frames[: max(last, 0) + 1])
     settings = settings.with_values(num_frames=int(config.first) + int(config.every) * (len(observed.frames) - 1) + 1)
     check_config(settings)
+    for sentence in idle_in_rollout(["stepper=newton", *given], settings):
+        say(sentence)
     scene = _Scene(settings, observed, int(config.first), int(config.every))
     scene.check({one.name: one.guess for one in unknowns})
     folder = prepare_folder(output_folder(config))
@@ -216,8 +219,7 @@ def _value(settings: RolloutSettings, name: str) -> Any:
     """What the keys of the rollout say of a parameter."""
     kind = KINDS[name]
     if kind.key == "wind":
-        wind = plain(settings.wind)
-        return wind["xyz".index(name[-1])] if isinstance(wind, list) and len(wind) == 3 else 0.0
+        return _wind(settings)["xyz".index(name[-1])]
     value = OmegaConf.select(OmegaConf.create(dict(settings)), kind.key, default=None)
     if value is None:
         raise ConfigError(
@@ -226,11 +228,19 @@ def _value(settings: RolloutSettings, name: str) -> Any:
     return plain(value)
 
 
-def _words(values: Mapping[str, float]) -> list[str]:
-    """The keys of ``hood rollout`` with these values."""
+def _wind(settings: RolloutSettings) -> list[float]:
+    """[m/s] along x, y and z; still air where there is none, or where that is left to the fabric."""
+    wind = plain(settings.wind)
+    if isinstance(wind, list):
+        return wind
+    return [0.0, 0.0, 0.0 if wind is None or isinstance(wind, str) else -float(wind)]
+
+
+def _words(values: Mapping[str, float], settings: RolloutSettings) -> list[str]:
+    """The keys of ``hood rollout`` with these values; what of the wind is not fitted is that of the settings."""
     keys: dict[str, Any] = {KINDS[name].key: value for name, value in values.items() if KINDS[name].key != "wind"}
     if any(KINDS[name].key == "wind" for name in values):
-        keys["wind"] = [values.get(name, 0.0) for name in _SEVERAL["wind"]]
+        keys["wind"] = [values.get(name, usual) for name, usual in zip(_SEVERAL["wind"], _wind(settings), strict=True)]
     return overrides(keys)
 
 
@@ -238,7 +248,7 @@ class _Scene:
     """The simulation of values, and how far it lies from what was seen."""
 
     def __init__(self, settings: RolloutSettings, observed: Observed, first: int, every: int) -> None:
-        self._settings, self.observed, self._first, self._every = settings, observed, first, every
+        self.settings, self.observed, self._first, self._every = settings, observed, first, every
         self.ready: Setup | None = None
 
     def check(self, values: Mapping[str, float]) -> None:
@@ -261,11 +271,11 @@ class _Scene:
                 )
 
     def _set_up(self, values: Mapping[str, float]) -> Setup:
-        words = _words(values)
+        words = _words(values, self.settings)
         words += [f"losses.terms.air.velocity={word.partition('=')[2]}" for word in words if word.startswith("wind=")]
         for term in ("stretch_damping", "bend_damping"):
             words += [f"losses.terms.{term}.time={word.partition('=')[2]}" for word in words if word.startswith("damping=")]
-        settings = self._settings.with_words(words)
+        settings = self.settings.with_words(words)
         with nullcontext() if self.ready is None else unheard():  # what is said of the scene is said once
             return set_up(settings, make_stepper(settings)[0], tell=lambda sentence: None)
 
@@ -303,7 +313,6 @@ class _Fit:
     def __init__(self, config: DictConfig, scene: _Scene, unknowns: list[Unknown], words: list[str], folder: Path) -> None:
         self._config, self._scene, self._unknowns, self._words, self._folder = config, scene, unknowns, words, folder
         self._history: list[tuple[float, float]] = []  # share of the frames and rms
-        self._evaluations = 0
 
     def run(self) -> Fitted:
         now, count, interrupted = None, 0, False
@@ -340,7 +349,7 @@ class _Fit:
         def residual(values: Mapping[str, float]) -> np.ndarray:
             return self._scene.residual(values, count)
 
-        steps = search(residual, self._unknowns, noise, _LEAST_NOISE, int(self._config.most_steps), free, last)
+        steps = fit_steps(residual, self._unknowns, noise, _LEAST_NOISE, int(self._config.most_steps), free, last)
         for step, now in enumerate(steps):
             if now.covariance is None:
                 self._history.append((count / len(self._scene.observed.frames), now.rms))
@@ -352,7 +361,7 @@ class _Fit:
     def _content(self, now: Minimum, count: int) -> dict[str, Any]:
         """What ``fit.json`` holds."""
         found = {one.name: {"value": now.values[one.name], "unit": KINDS[one.name].unit} for one in self._unknowns}
-        said: list[str] = []
+        said, brief = list[str](), {name: float(f"{value:.6g}") for name, value in now.values.items()}
         if now.covariance is not None:
             told = estimates(now, self._unknowns)
             ratios = seen_ratios(now, self._unknowns, told)
@@ -363,8 +372,10 @@ class _Fit:
                 f"only the ratio of {one} and {other} is seen, to {100 * share:.2g}%: what scales both changes nothing here"
                 for (one, other), share in ratios.items()
             ]
-        if not now.converged:
-            said.append(f"not converged after {int(self._config.most_steps)} steps; give a better guess, or more steps")
+            if not now.converged:
+                said.append(
+                    "not converged: these are the best values so far; give another guess, tighter bounds or more most_steps"
+                )
         return {
             "parameters": found,
             "said": said,
@@ -374,7 +385,7 @@ class _Fit:
             "frames": count,
             "history": [{"share": share, "rms": rms} for share, rms in self._history],
             "observed": str(self._config.observed),
-            "command": " ".join(["hood rollout", *self._words, *_words({n: float(f"{v:.6g}") for n, v in now.values.items()})]),
+            "command": " ".join(["hood rollout", *self._words, *_words(brief, self._scene.settings)]),
         }
 
     def _write(self, content: dict[str, Any]) -> None:
@@ -388,7 +399,8 @@ class _Fit:
             from hood.media.video import save_png
 
             write_course([1e3 * rms for _, rms in self._history], "mm from what was seen", "step", self._folder / "loss.png")
-            frames = [*self._scene.frames(now.values, len(self._scene.observed.frames))]
+            with heard(aloud=False):
+                frames = [*self._scene.frames(now.values, len(self._scene.observed.frames))]
             assert self._scene.ready is not None
             fitted = _data(self._scene.ready, frames)
             seen = self._scene.observed.drawn(fitted)

@@ -20,7 +20,7 @@ from hood.assets.formats.vertex_files import read_points_folder
 from hood.mesh.closest_point.search import search_surface
 from hood.rollouts.file.reader import RolloutData, read_rollout
 
-Residual = Callable[[Mapping[str, float]], np.ndarray]
+Apart = Callable[[Mapping[str, float]], np.ndarray]
 
 #: Forward differences in the logarithm of an unknown, or in an unknown of a linear scale.
 _STEP = 0.01
@@ -66,7 +66,7 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Told:
     """An unknown as it was found: its value, the 95% interval, whether the data tell it, and whether it is at a bound."""
 
     value: float
@@ -97,8 +97,8 @@ class Minimum:
     history: tuple[float, ...] = ()
 
 
-def search(
-    residual: Residual,
+def fit_steps(
+    residual: Apart,
     unknowns: Sequence[Unknown],
     noise: float | None,
     least_noise: float,
@@ -124,14 +124,14 @@ def search(
         >>> t = np.linspace(0.0, 1.0, 20)
         >>> unknowns = [Unknown("height", 1.0, 0.1, 10.0), Unknown("rate", 1.0, 0.1, 10.0)]
         >>> seen = 2.0 * np.exp(-3.0 * t)
-        >>> *_, last = search(lambda of: of["height"] * np.exp(-of["rate"] * t) - seen, unknowns, None, 1e-6, 20)
+        >>> *_, last = fit_steps(lambda of: of["height"] * np.exp(-of["rate"] * t) - seen, unknowns, None, 1e-6, 20)
         >>> last.converged, round(last.values["rate"], 3)
         (True, 3.0)
     """
     return _Search(residual, list(unknowns), noise, least_noise, free).run(most_steps, intervals)
 
 
-def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Estimate]:
+def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Told]:
     """What a minimum with its covariance says of every unknown."""
     assert minimum.covariance is not None
     found = {}
@@ -141,7 +141,7 @@ def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Estima
         ends = [_bounded(unknown, place - half), _bounded(unknown, place + half)]
         at_bound = min(place - unknown.place(unknown.lower), unknown.place(unknown.upper) - place) < 1e-6
         seen = half < (math.log(SEEN) if unknown.log else max(abs(value), 1.0))
-        found[unknown.name] = Estimate(value, *ends, bool(seen), bool(at_bound))
+        found[unknown.name] = Told(value, *ends, bool(seen), bool(at_bound))
     return found
 
 
@@ -150,7 +150,7 @@ def _bounded(unknown: Unknown, place: float) -> float:
     return unknown.value(min(max(place, low), high))
 
 
-def seen_ratios(minimum: Minimum, unknowns: Sequence[Unknown], found: Mapping[str, Estimate]) -> dict[tuple[str, str], float]:
+def seen_ratios(minimum: Minimum, unknowns: Sequence[Unknown], found: Mapping[str, Told]) -> dict[tuple[str, str], float]:
     """Pairs of logarithmic unknowns of which the data tell only the ratio, with the share to which it is told: each alone is
     not seen."""
     assert minimum.covariance is not None
@@ -231,7 +231,7 @@ def observed_frames(given: Any, points: bool, most: int) -> Observed:
 
 
 class _Search:
-    def __init__(self, residual: Residual, unknowns: list[Unknown], noise: float | None, least: float, free: int) -> None:
+    def __init__(self, residual: Apart, unknowns: list[Unknown], noise: float | None, least: float, free: int) -> None:
         self._residual, self._unknowns, self._noise, self._least, self._free = residual, unknowns, noise, least, free
         self._rows = 0
         self._low = np.array([one.place(one.lower) for one in unknowns])
