@@ -20,7 +20,7 @@ from hood.assets.formats.vertex_files import read_points_folder
 from hood.mesh.closest_point.search import search_surface
 from hood.rollouts.file.reader import RolloutData, read_rollout
 
-Apart = Callable[[Mapping[str, float]], np.ndarray]
+Misfit = Callable[[Mapping[str, float]], np.ndarray]
 
 #: Forward differences in the logarithm of an unknown, or in an unknown of a linear scale.
 _STEP = 0.01
@@ -98,7 +98,7 @@ class Minimum:
 
 
 def fit_steps(
-    residual: Apart,
+    residual: Misfit,
     unknowns: Sequence[Unknown],
     noise: float | None,
     least_noise: float,
@@ -231,7 +231,7 @@ def observed_frames(given: Any, points: bool, most: int) -> Observed:
 
 
 class _Search:
-    def __init__(self, residual: Apart, unknowns: list[Unknown], noise: float | None, least: float, free: int) -> None:
+    def __init__(self, residual: Misfit, unknowns: list[Unknown], noise: float | None, least: float, free: int) -> None:
         self._residual, self._unknowns, self._noise, self._least, self._free = residual, unknowns, noise, least, free
         self._rows = 0
         self._low = np.array([one.place(one.lower) for one in unknowns])

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from hood.evaluation.fitting import Apart, Minimum, Unknown, estimates, fit_steps, seen_ratios
+from hood.evaluation.fitting import Minimum, Misfit, Unknown, estimates, fit_steps, seen_ratios
 
 TIMES = np.linspace(0.0, 2.0, 40)
 
@@ -21,7 +21,7 @@ def two(guess: float = 1.0) -> list[Unknown]:
     return [Unknown("height", guess, 0.01, 100.0), Unknown("rate", guess, 0.01, 100.0)]
 
 
-def solved(residual: Apart, unknowns: Sequence[Unknown], noise: float | None = None, most: int = 40) -> Minimum:
+def solved(residual: Misfit, unknowns: Sequence[Unknown], noise: float | None = None, most: int = 40) -> Minimum:
     *_, last = fit_steps(residual, unknowns, noise, 1e-9, most)
     return last
 
