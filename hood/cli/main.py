@@ -70,7 +70,7 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
     2: "an error, in one line; rollout: a motion of many could not be used; dress: too many rows failed; train -m: a run",
-    3: "rollout: unsound, or doubtful with fail_on=doubts, or guard=strict; dress: too many; sew: badly; fit: not converged",
+    3: "rollout: unsound, doubtful with fail_on=doubts, or guard=strict; dress: too many; sew: badly; fit: not converged",
     130: "interrupted; what is done is kept",
 }
 
