@@ -30,8 +30,9 @@ _LONG_STEP = 0.03
 _FARTHEST = 1.2
 #: Damping at first, its factors after a step that was taken and one that was not, and where the search gives up.
 _DAMPING, _EASIER, _HARDER, _MOST_DAMPING = 1e-2, 0.2, 6.0, 1e6
-#: The minimum is reached where the Gauss-Newton step is shorter than this many standard deviations, or promises this share.
-_SHORT, _SHARE = 0.2, 1e-5
+#: The minimum is reached where the Gauss-Newton step is shorter than this many standard deviations, promises no more than this
+#: share, or is smaller than the third number: a simulation is not smooth to any digit.
+_SHORT, _SHARE, _SMALL = 0.2, 1e-5, 5e-4
 #: Half the width of a 95% interval in standard deviations.
 _WIDTH = 1.96
 #: An unknown is seen where its interval is narrower than by this factor up and down.
@@ -316,7 +317,7 @@ class _Search:
             return None, r, damping, True
         best = self._damped(matrix, slope, free, 1e-9)
         promised = -float(slope @ best) - 0.5 * float(best @ matrix @ best)
-        done = promised < max(_SHORT**2, _SHARE * cost)
+        done = promised < max(_SHORT**2, _SHARE * cost) or float(np.abs(best).max()) < _SMALL
         while damping < _MOST_DAMPING:
             step = self._damped(matrix, slope, free, damping)
             step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-300))

@@ -130,7 +130,7 @@ SLOW = (
     (r"^(inspect|prepare) .*my_shirt\.obj( my_walk\.npz)?$", "files of another name"),
 )
 #: Commands that are told which files to read; their bare names, as the text has them, ask for those.
-READERS = {"inspect", "prepare", "view", "export", "compare", "convert", "sew"}
+READERS = {"inspect", "prepare", "view", "export", "compare", "convert", "sew", "fit"}
 
 
 def chosen(line: str) -> list[str]:
