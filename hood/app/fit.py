@@ -122,7 +122,9 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
     settings = RolloutSettings.from_words([*_USUAL, *given])
     unknowns = _unknowns(config, settings, names)
     if frames is None and config.observed is None:
-        raise ConfigError("observed: nothing was observed; give a rollout.h5 or a folder: hood fit observed=scans garment=dress")
+        raise ConfigError(
+            "observed: nothing was observed; give a rollout.h5 or a folder: hood fit observed=scans garment=dress"
+        )
     observed = observed_frames(str(config.observed) if frames is None else frames, bool(config.points), int(config.most_points))
     if "num_frames" in {word.partition("=")[0] for word in given}:
         last = (int(settings.num_frames) - int(config.first) - 1) // int(config.every)

@@ -199,6 +199,7 @@ def promised(words: Sequence[str]) -> list[str]:
         "envelope": ("outputs/envelope", ["index.html", "envelope.json", "envelope.csv"]),
         "plan": ("outputs/plan", ["training_plan.json"] if training else ["plan.json", "plan.html"]),
         "sizes": ("outputs/sizes", ["sheet.png", "sizes.json"]),
+        "fit": ("outputs/fit", ["fit.json", "loss.png", "beside.png"]),
         "fabric": ("", ["shadows.png", "fabrics.json"]),
         "compare": ("outputs/compare", ["contact_sheet.png", "key.json"]),
     }[command]
