@@ -139,10 +139,10 @@ def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Told]:
     for unknown, variance in zip(unknowns, np.diag(minimum.covariance), strict=True):
         value, half = minimum.values[unknown.name], _WIDTH * math.sqrt(variance)
         place = unknown.place(value)
-        ends = [_bounded(unknown, place - half), _bounded(unknown, place + half)]
+        low, high = _bounded(unknown, place - half), _bounded(unknown, place + half)
         at_bound = min(place - unknown.place(unknown.lower), unknown.place(unknown.upper) - place) < 1e-6
         seen = half < (math.log(SEEN) if unknown.log else max(abs(value), 1.0))
-        found[unknown.name] = Told(value, *ends, bool(seen), bool(at_bound))
+        found[unknown.name] = Told(value, low, high, bool(seen), bool(at_bound))
     return found
 
 

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def followed(folder: Path, target: float, **scene: Any) -> tuple[DifferentiableFrames, dict[str, Tensor]]:
     of = {"lame_mu": 2e4, "bending_stiffness": 1e-4}
-    given = {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in of.items()}
+    given: dict[str, Any] = {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in of.items()}
     keys: dict[str, Any] = {
         "num_frames": 5,
         "settle": 0,
