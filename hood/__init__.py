@@ -22,6 +22,7 @@ _HOMES = {
     "rollout": "hood.api",
     "dress": "hood.api",
     "differentiable": "hood.api",
+    "fit": "hood.app.fit",
     "export": "hood.api",
     "view": "hood.api",
     "train": "hood.api",

@@ -35,11 +35,10 @@ from hood.assets.material import Material
 from hood.assets.motion.animated_mesh import BodyMesh
 from hood.assets.motion.sequence import PoseSequence, checked_sequence
 from hood.cloth.cloth import with_values
-from hood.cloth.state import State
 from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
-from hood.rollouts.differentiable import differentiable_states
 from hood.rollouts.frame import Frame
+from hood.rollouts.gradients import DifferentiableFrames
 from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import NewtonStepper, Stepper, require_stepper
@@ -180,7 +179,7 @@ def differentiable(
     rest_pos: Tensor | None = None,
     flat: Tensor | None = None,
     **fabric: Tensor | float,
-) -> Iterator[State]:
+) -> DifferentiableFrames:
     """States of the frames 1, 2, … of a simulation by the solver, as functions that torch differentiates.
 
     Every step ends at the minimum of one known potential, so that its derivative is exact (implicit function theorem): contact,
@@ -196,8 +195,9 @@ def differentiable(
         fabric: ``lame_mu``, ``density``, …: one number or as many as there are faces, hinges (``bending_stiffness``) or
             vertices (``friction``).
 
-    Yields:
-        :class:`hood.cloth.state.State`; where the cloth is in the world, (V, 3) m, is ``state.origin + state.pos``.
+    Returns:
+        An iterator of :class:`hood.cloth.state.State`; where the cloth is in the world, (V, 3) m, is ``state.origin +
+        state.pos``. Its :meth:`hood.rollouts.gradients.DifferentiableFrames.gradients` says how exact gradients are.
 
     Raises:
         ValueError: another stepper, a value that does not fit, an event that cuts the cloth, or a body that jumps.
@@ -218,7 +218,10 @@ def differentiable(
     count = simulation.num_frames if num_frames is None else min(num_frames, simulation.num_frames)
     start = next(iter(simulation)).state
     cloth = with_values(to_device(simulation.scene.cloth, dtype=torch.float64), rest_pos, flat, **fabric)
-    return differentiable_states(stepper, simulation.scene, start, count - 1, cloth, gravity)
+    given = {"gravity": gravity, "rest_pos": rest_pos, "flat": flat, **fabric}
+    given |= {f"{name}.{key}": value for name, term in stepper.potential.terms.items() for key, value in vars(term).items()}
+    tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+    return DifferentiableFrames(stepper, simulation.scene, start, count - 1, cloth, gravity, tensors)
 
 
 def _own(garment: Any, body: Any, sequence: Any, material: Any) -> tuple[Own, dict[str, Any]]:

@@ -40,7 +40,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 #: Of a value that is given as a tensor with a gradient.
-NO_GRADIENT = "its tensor requires a gradient, and a simulation passes none back to it; give value.detach()"
+NO_GRADIENT = (
+    "its tensor requires a gradient, and a simulation passes none back to it, as hood.differentiable does; give value.detach()"
+)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,10 @@ _EXAMPLES = {
         "hood dress rows=rows.csv dry_run=true",
         "hood dress motions=[amass] root=amass output=outputs/set engine=slurm workers=40",
     ],
+    "fit": [
+        "hood fit observed=outputs/dress/rollout.h5 parameters=[fabric,size] garment=dress sequence=walk_steady",
+        "hood fit observed=scans points=true garment=dress guess={size:1.1} priors={density:[0.2,0.1]} output=outputs/fit",
+    ],
     "plan": [
         "hood plan garment=dress sequence=plie stepper=newton accuracy=0.01",
         "hood plan garment=[tank,skirt] sequence=walk_proud stepper=newton accuracy=5mm frames=30",
@@ -154,6 +158,8 @@ def describe(name: str) -> str:
     if name == "plan":
         lines += ["", "The keys of hood rollout say the scene and the full model: garment, sequence, stepper, fps, …"]
         lines += ["The keys of hood train say a training; experiment=, trainer= or data.* has to be among them."]
+    if name == "fit":
+        lines += ["", "All other keys are those of hood rollout and say the scene: garment, body, sequence, pins, fps, …"]
     if name == "dress":
         lines += ["", "All other keys are those of hood rollout, the same for all rows: stepper, num_frames, fps, metrics, …"]
     if name == "fabric":
@@ -213,7 +219,7 @@ def answer(name: str, words: Sequence[str]) -> int:
 
 def _composed(name: str, words: Sequence[str]) -> DictConfig:
     """The config of a command, with that of the command whose keys it takes beside its own."""
-    if name not in ("dress", "plan"):
+    if name not in ("dress", "fit", "plan"):
         return load_config(name, words)
     mine = [word for word in words if word.partition("=")[0] in load_config(name) or word.startswith("-")]
     theirs = [word for word in words if word not in mine]

@@ -37,6 +37,7 @@ COMMANDS = {
     "prepare": "repair a garment, fit it to a body and write it for rollouts",
     "sew": "sew a pattern around a body: the garment, its sheet, and a verdict",
     "fabric": "compare fabrics, and drape them over a disc",
+    "fit": "find fabric, size, friction and wind from frames that were seen, with intervals",
     "sizes": "show several sizes of a garment on several bodies: how each sits, and one sheet",
     "plan": "measure which parts of the model a scene needs, and what each costs",
     "train": "train a network",
@@ -57,6 +58,7 @@ _HOMES = {
     "prepare": "hood.cli.prepare.prepare:run",
     "sew": "hood.cli.sew:run",
     "fabric": "hood.cli.fabric:run",
+    "fit": "hood.cli.rollout:fitted",
     "sizes": "hood.cli.sizes:run",
     "train": "hood.cli.rollout:train",
     "evaluate": "hood.cli.evaluate:run",
@@ -68,7 +70,7 @@ EXIT_CODES = {
     0: "done",
     1: "inspect: something needs repair; tradeoff: points failed, the page is without them",
     2: "an error, in one line; rollout: a motion of many could not be used; dress: too many rows failed; train -m: a run",
-    3: "rollout: unsound, or doubtful with fail_on=doubts, or ended by guard=strict; dress: too many; sew: not sewn well",
+    3: "rollout: unsound, doubtful with fail_on=doubts, or guard=strict; dress: too many; sew: badly; fit: not converged",
     130: "interrupted; what is done is kept",
 }
 
@@ -77,7 +79,7 @@ _LESS_MEMORY = "free some, raise the limit (ulimit -v), or take a smaller garmen
 #: Words with dashes of commands that take steps; others ask what a command would do.
 _SWEEP = ("-m", "--multirun")
 #: Commands that take steps: libraries for these are compiled while torch is loaded, where that has not been done before.
-_SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "sizes", "sew")
+_SIMULATE = ("train", "rollout", "dress", "evaluate", "tradeoff", "envelope", "plan", "fabric", "fit", "sizes", "sew")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

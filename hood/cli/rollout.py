@@ -1,5 +1,5 @@
-"""``hood rollout``, ``hood dress`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout`,
-:mod:`hood.app.batch.dress` and :mod:`hood.app.train`."""
+"""``hood rollout``, ``hood dress``, ``hood fit`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout`,
+:mod:`hood.app.batch.dress`, :mod:`hood.app.fit` and :mod:`hood.app.train`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 from hood.app.batch.dress import dress_rows
+from hood.app.fit import run_fit
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
@@ -48,6 +49,11 @@ def dressed(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where more rows failed than
     ``fail_fraction`` says, else 3 where more are unsound, else 0."""
     return dress_rows(overrides).code
+
+
+def fitted(overrides: Sequence[str]) -> int:
+    """Run ``hood fit``; returns the exit code: 130 where the user interrupted it, 3 where it has not converged, else 0."""
+    return run_fit(overrides).code
 
 
 def train(overrides: Sequence[str]) -> int:

@@ -57,6 +57,20 @@ def write_bars(panels: Mapping[str, _Panel], path: Path) -> None:
     write_png(figure, path, dpi=100)
 
 
+def write_course(values: Sequence[float], title: str, across: str, path: Path) -> None:
+    """Draw positive values in their order as a line on a logarithmic scale into a PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.0, 3.0), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy(range(len(values)), [max(value, 1e-9) for value in values], marker="o", markersize=3, color=COLOURS[0])
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel(across, fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#e6e6e6")
+    write_png(figure, path, dpi=100)
+
+
 def write_png(figure: Any, path: Path, dpi: int = 150) -> None:
     """Write the figure as a picture; the file appears when it is complete."""
     content = io.BytesIO()

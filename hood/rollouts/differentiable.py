@@ -44,7 +44,11 @@ _T = TypeVar("_T")
 _TOLERANCE, _MOST_PRODUCTS = 1e-9, 200
 
 
-def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
+#: Is shown the potential, the problem of a step with the contact that it was taken with, and its minimum (V, 3) m.
+Watch = Callable[[Potential, StepProblem, Tensor], None]
+
+
+def differentiable_step(stepper: NewtonStepper, problem: StepProblem, watch: Watch | None = None) -> State:
     """The state at t + 1: the solver's, differentiable by every tensor of ``problem`` that requires a gradient.
 
     Those are the fields of its cloth (:func:`hood.cloth.cloth.with_values` makes them of a fabric and a rest shape), positions
@@ -79,6 +83,8 @@ def differentiable_step(stepper: NewtonStepper, problem: StepProblem) -> State:
         found = problem.state.pos.dtype if wrong is None else wrong.dtype
         raise ValueError(f"differentiable step: a tensor is {found}; give cloth, state and parameters in torch.float64")
     solved = _Solved(stepper, problem, given)
+    if watch is not None:
+        watch(solved._plain, solved.taken, solved.pos)
     pos = _Minimum.apply(solved, *given)
     change = (pos - problem.state.pos) / problem.vertex_dt
     # The velocity is the solver's, its derivative that of the difference.
@@ -92,6 +98,7 @@ def differentiable_states(
     num_steps: int,
     cloth: Cloth | None = None,
     gravity: Tensor | None = None,
+    watch: Watch | None = None,
 ) -> Iterator[State]:
     """States of the frames after ``state``, which is that of frame 0, each differentiable by all that came before; see
     :func:`differentiable_step`. The origin of their frame stays where that of ``state`` is.
@@ -99,6 +106,7 @@ def differentiable_states(
     Args:
         cloth: default the scene's; :func:`hood.cloth.cloth.with_values` of that with a fabric to differentiate by.
         gravity: (3,) m/s²; default the stepper's.
+        watch: is shown every step when it has been taken.
 
     Raises:
         ValueError: an event cuts the cloth in these frames, or the body jumps.
@@ -113,7 +121,7 @@ def differentiable_states(
             raise ValueError(f"differentiable: the body jumps in frame {frame}; ask for fewer frames")
         step = scene.step_input(frame, state)
         step = StepInput(*(_in_double(getattr(step, spec.name)) for spec in fields(step)))
-        state = differentiable_step(stepper, StepProblem(cloth, state, step, gravity=gravity))
+        state = differentiable_step(stepper, StepProblem(cloth, state, step, gravity=gravity), watch)
         yield state
 
 

@@ -62,6 +62,10 @@ def check_command(command: str, keys: list[str]) -> None:
             known = names(kind) if kind else options("material")
             assert {str(name) for name in config[key] if isinstance(name, str)} <= {*known}, key
         command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
+    if command == "fit":
+        own = set(load_config("fit"))
+        load_config("fit", [word for word in keys if word.partition("=")[0] in own])
+        command, keys = "rollout", [word for word in keys if word.partition("=")[0] not in own]
     config = load_config(command, keys)
     if command == "rollout":
         check_config(config)

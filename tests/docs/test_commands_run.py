@@ -81,6 +81,7 @@ SHORT = (
     Short(r"^rollout.*plan=[0-9]", ("num_frames=12",), "windows of the plan that comes first are as long"),
     Short("^plan(?!.*experiment)", ("windows=1", "frames=1", "parts=[friction]", "num_frames=12"), "one row of the table"),
     Short("^plan.*experiment", ("updates=1", "scenes=2"), "as few as there may be"),
+    Short("^fit", ("num_frames=2", "parameters=[size]"), "one parameter of two frames"),
     Short("^sizes", ("num_frames=1", "shapes=[[]]"), "the garments at rest, on one body"),
     Short("^sizes(?!.*sizes=)", ("sizes={S:0.95,M:1}",), "two of the sizes"),
     Short("^fabric.*output", ("edges=[0.03]",), "the coarsest mesh that there may be"),
@@ -129,7 +130,7 @@ SLOW = (
     (r"^(inspect|prepare) .*my_shirt\.obj( my_walk\.npz)?$", "files of another name"),
 )
 #: Commands that are told which files to read; their bare names, as the text has them, ask for those.
-READERS = {"inspect", "prepare", "view", "export", "compare", "convert", "sew"}
+READERS = {"inspect", "prepare", "view", "export", "compare", "convert", "sew", "fit"}
 
 
 def chosen(line: str) -> list[str]:
@@ -198,6 +199,7 @@ def promised(words: Sequence[str]) -> list[str]:
         "envelope": ("outputs/envelope", ["index.html", "envelope.json", "envelope.csv"]),
         "plan": ("outputs/plan", ["training_plan.json"] if training else ["plan.json", "plan.html"]),
         "sizes": ("outputs/sizes", ["sheet.png", "sizes.json"]),
+        "fit": ("outputs/fit", ["fit.json", "loss.png", "beside.png"]),
         "fabric": ("", ["shadows.png", "fabrics.json"]),
         "compare": ("outputs/compare", ["contact_sheet.png", "key.json"]),
     }[command]

@@ -29,19 +29,19 @@ CONFIG_FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PA
 #: Keys that take one word or number, or a list.
 _ONE_OR_MORE = ("garment", "offset", "layers", "size", "blend_in", "video")
 #: Keys that take a table of parts, some beside numbers and lists.
-TABLES = tuple("size size_end fabrics pins refine metrics cloth_contact objects trainer.optimizer trainer.schedule".split())
+TABLES = (
+    *"size size_end fabrics pins refine metrics cloth_contact objects guess bounds priors".split(),
+    *("trainer.optimizer", "trainer.schedule"),
+)
 #: Keys in here may be null: an energy that is left out.
 _OPTIONAL = "losses.terms."
 #: A key that its command checks itself; and those that are "auto", or a value of another kind that their reader checks.
 _FOLDER, _OPEN = "output", ("wind", "velocity")
-#: Of a key that is not there.
-_ABSENT = object()
+_ABSENT = object()  # of a key that is not there
 #: What a value must be, by the type of the default that it replaces.
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", ListConfig: "a list in brackets"}
-#: Characters of a comment that is repeated in a message; a longer one is read in --help.
-_SHORT_NOTE = 160
-#: Characters of a value, and of a reason why something cannot be read, that a message repeats at most.
-_BRIEF, _REASON = 100, 300
+#: Characters that a message repeats at most, of a comment (a longer one is read in --help), a value and a reason.
+_SHORT_NOTE, _BRIEF, _REASON = 160, 100, 300
 #: Words with dashes that ask for a sweep.
 SWEEP_FLAGS = ("-m", "--multirun")
 #: Keys of a rollout that say which network takes the steps and how it computes, and how they are refined: who gives one means

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from hood.assets.files.guarded import first_line, own_dataset
+from hood.assets.files.guarded import check_size, first_line, guarded, own_dataset
 from hood.assets.files.library import SIZE_LIMIT, read_arrays
 from hood.assets.files.text import rates_in
 from hood.assets.formats.mesh_file import MeshFile, read_mesh, read_mesh_file
@@ -118,6 +118,35 @@ def read_mesh_folder(folder: Path) -> VertexFile:
             raise ValueError(f"{path}: its faces are not those of {files[0].name}; every frame must be the same mesh")
         verts[frame] = pos
     return VertexFile(verts, faces)
+
+
+def read_points_folder(folder: Path) -> list[np.ndarray]:
+    """Points (P, 3) [m] of a folder of OBJ or PLY files, one a frame, in the order of the numbers in their names; faces may be
+    there or not.
+
+    Raises:
+        ValueError: no such files, a number between the first and the last that is missing, or a file without points.
+    """
+    import trimesh
+
+    files = sorted((path for path in folder.iterdir() if path.suffix.lower() in FOLDER_SUFFIXES), key=_number)
+    if not files:
+        raise ValueError(f"{folder}: no OBJ or PLY files in this folder; give one a frame, numbered")
+    numbers = [(_number(path)[0] or [0])[-1] for path in files]
+    missing = next((before + 1 for before, after in zip(numbers, numbers[1:], strict=False) if after != before + 1), None)
+    if missing is not None and len(files) > 1:
+        raise ValueError(
+            f"{folder}: there is no frame {missing} between {files[0].name} and {files[-1].name}; number them 0, 1, 2, …"
+        )
+    frames = []
+    for path in files:
+        check_size(path, SIZE_LIMIT)
+        read = guarded(path, f"{path.suffix[1:].upper()} file", lambda path=path: trimesh.load(path, process=False))
+        points = np.asarray(getattr(read, "vertices", np.zeros((0, 3))), dtype=np.float64)
+        if not len(points):
+            raise ValueError(f"{path}: holds no points")
+        frames.append(points)
+    return frames
 
 
 def _same_polygons(one: MeshFile, other: MeshFile) -> bool:
