@@ -15,7 +15,7 @@ from hood.app.output.frames import check_output_fps, check_refine_mesh
 from hood.app.output.verdict import FAIL_ON
 from hood.app.plan_file import plan_path, read_watch
 from hood.app.scene.events import checked_events, with_events
-from hood.app.scene.fabrics import checked_fabrics, fabric_of
+from hood.app.scene.fabrics import checked_fabrics, fabric_of, with_body_friction
 from hood.app.scene.garment_files import wanted_of
 from hood.app.scene.garments import (
     checked_sizes,
@@ -27,7 +27,7 @@ from hood.app.scene.garments import (
     read_outfit,
     with_pins,
 )
-from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion, with_body_friction
+from hood.app.scene.motion import NAMED, Own, check_motion_options, make_motion
 from hood.app.settings.compose import ConfigError, brief, require_choice
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes, measurement
 from hood.app.stepping.automatic import Choice, choose, decided

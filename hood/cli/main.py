@@ -59,7 +59,7 @@ _HOMES = {
     "sew": "hood.cli.sew:run",
     "fabric": "hood.cli.fabric:run",
     "fit": "hood.cli.rollout:fitted",
-    "sizes": "hood.cli.sizes:run",
+    "sizes": "hood.cli.sew:sizes",
     "train": "hood.cli.rollout:train",
     "evaluate": "hood.cli.evaluate:run",
     "convert": "hood.cli.export:convert",

@@ -10,13 +10,14 @@ from torch import Tensor
 from hood.assets.body.body import Body
 from hood.assets.garment.binding import bind_garment
 from hood.assets.garment.garment import Garment
+from hood.assets.garment.mirror import mirror_body, mirror_garment, reflect
 from hood.assets.material import Material, sample_material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.state import State
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.scene.scene import Scene, build_scene
-from hood.training.scenes import SceneSampler, mirror_body, mirror_garment, reflect
+from hood.training.scenes import SceneSampler
 
 
 @pytest.fixture(scope="module", params=["tank", "skirt"])

@@ -25,7 +25,7 @@ import h5py
 
 from hood.app.common import output_folder
 from hood.app.notices import say
-from hood.app.output.summary import summarise
+from hood.app.output.summary import summarise_file
 from hood.app.settings.compose import ConfigError, brief, load_config, options, plain
 from hood.app.settings.record import read_settings
 from hood.app.settings.rollout_settings import RolloutSettings
@@ -33,9 +33,7 @@ from hood.app.setup import make_scene, make_stepper
 from hood.app.stepping.automatic import AUTO, choose, decided
 from hood.app.stepping.steppers import GROUP, with_air, with_stepper
 from hood.assets.files.atomic import occupy, write_atomically
-from hood.assets.files.library import locate, names
-from hood.assets.motion.motion_files import LISTS, find_motions
-from hood.rollouts.file.reader import read_rollout
+from hood.assets.motion.motion_files import LISTS, file_named, find_motions, is_embedded
 from hood.training import distributed
 
 _NAME = "summary.json"
@@ -140,7 +138,7 @@ def require_motions(key: str, entries: Sequence[str]) -> None:
         if has_magic(entry) or Path(entry).suffix.lower() in LISTS or Path(entry).expanduser().is_dir():
             continue
         try:
-            locate("motions", entry)
+            file_named(entry)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{key}[{index}]: {error}") from error
 
@@ -267,13 +265,13 @@ def motion_attributes(sequence: str) -> dict[str, str]:
 
 def motion_file(sequence: str) -> str:
     """The whole path of a motion's file, the name of an embedded one."""
-    return sequence if sequence in names("motions") else os.path.realpath(Path(sequence).expanduser())
+    return sequence if is_embedded(sequence) else os.path.realpath(Path(sequence).expanduser())
 
 
 def motion_digest(file: str) -> str:
     """SHA-256 of a motion's file or of an embedded one; :data:`NO_FILE` where there is no such file."""
     try:
-        return hashlib.sha256(locate("motions", file).read_bytes()).hexdigest()
+        return hashlib.sha256(file_named(file).read_bytes()).hexdigest()
     except (OSError, ValueError):
         return NO_FILE
 
@@ -360,7 +358,7 @@ def finished(config: RolloutSettings, digest: str, folder: Path) -> dict[str, An
         return None
     if attributes is None or attributes["checkpoint_sha256"] != digest or other_settings(config, attributes):
         return None
-    return summary if {"sound", "doubts"} <= set(summary) else summarise(read_rollout(folder / "rollout.h5"))
+    return summary if {"sound", "doubts"} <= set(summary) else summarise_file(folder / "rollout.h5")
 
 
 def made_otherwise(config: RolloutSettings, folder: Path) -> str | None:

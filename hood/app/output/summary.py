@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,13 @@ from hood.app.settings.record import read_settings
 from hood.app.stepping.cloth_contact import describe_cloth_contact, summarise_cloth_contact
 from hood.app.stepping.guarding import summarise_guard
 from hood.app.stepping.refinement import describe_refinement, summarise_refinement
-from hood.rollouts.file.reader import RolloutData
+from hood.rollouts.file.reader import RolloutData, read_rollout
 from hood.solver.step_figures import MET, count_reasons, name_counts
+
+
+def summarise_file(path: Path) -> dict[str, Any]:
+    """That of the rollout in a file; see :func:`summarise`."""
+    return summarise(read_rollout(path))
 
 
 def summarise(data: RolloutData) -> dict[str, Any]:

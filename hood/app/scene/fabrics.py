@@ -1,13 +1,18 @@
-"""``material=`` and ``fabrics=``: what a garment of a rollout is made of, all of it or part by part."""
+"""``material=`` and ``fabrics=``: what a garment of a rollout is made of, all of it or part by part.
+
+``body_friction=``: parts of the body that grip the cloth more or less than the rest.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 from omegaconf import DictConfig
 
@@ -20,6 +25,8 @@ from hood.assets.material import Material, measured
 from hood.cloth.fabric import patchwork
 from hood.plugins import config_folders
 from hood.scene.body_motion.motion import BodyMotion, Motion
+from hood.scene.following import part_of
+from hood.scene.scene import Scene
 
 _MEASURED = f"{measured.__module__}.{measured.__name__}"
 AUTO = "auto"
@@ -154,3 +161,42 @@ def measured_in(config: Settings) -> list[str]:
 
 def _tells_measured(node: DictConfig) -> bool:
     return str(node.get("_target_")) == _MEASURED
+
+
+def checked_friction(config: Settings) -> dict[str, float]:
+    """``body_friction`` of a config: factors on the coefficient of friction by part of the body.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    value = plain(config.body_friction)
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not value:
+        raise ConfigError(f"body_friction={value}: give factors by part, such as body_friction={{left_wrist:3,below_pelvis:0}}")
+    for part, factor in value.items():
+        if isinstance(factor, bool) or not isinstance(factor, (int, float)) or not 0.0 <= factor < math.inf:
+            raise ConfigError(f"body_friction: {part} is {factor!r}; give a finite factor >= 0, 1 for the usual friction")
+    return {str(part): float(factor) for part, factor in value.items()}
+
+
+def with_body_friction(scene: Scene, config: Settings) -> Scene:
+    """The scene whose body grips as the config says; the same where it says nothing.
+
+    Raises:
+        ConfigError: the config has no such table, or there is no body.
+        ValueError: the body has no such part.
+    """
+    parts = checked_friction(config)
+    if not parts:
+        return scene
+    motion = scene.motion
+    if motion.num_vertices == 0:
+        raise ConfigError("body_friction: there is no body; leave it out")
+    grip = np.ones(len(motion.faces))
+    for part, factor in parts.items():
+        try:
+            grip[part_of(motion, part)] = factor
+        except ValueError as error:
+            raise ValueError(f"body_friction: {error}") from error
+    return replace(scene, friction_scale=torch.as_tensor(grip))

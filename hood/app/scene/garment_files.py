@@ -15,7 +15,7 @@ import numpy as np
 
 from hood.app.settings.compose import ConfigError, plain, require_choice
 from hood.app.settings.rollout_settings import Settings, objects
-from hood.assets.contents.objects import mend, take_objects
+from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.said import Doubt
 from hood.assets.fitting.suspicions import suspect_seams
 from hood.assets.formats.mesh_file import mesh_suffixes, read_mesh_file

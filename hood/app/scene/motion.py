@@ -1,18 +1,14 @@
-"""Reading the body and motion that a command is given.
-
-``body_friction=``: parts of the body that grip the cloth more or less than the rest.
-"""
+"""Reading the body and motion that a command is given."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from hood.app.notices import say
@@ -27,11 +23,9 @@ from hood.assets.motion.sequence import PoseSequence
 from hood.assets.motion.skeleton import TRANSLATION_UNITS
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
 from hood.scene.body_motion.motion import Motion
-from hood.scene.following import part_of
 
 if TYPE_CHECKING:
     from hood.assets.material import Material
-    from hood.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -50,45 +44,6 @@ class Own:
 
 #: A config that names everything.
 NAMED = Own()
-
-
-def checked_friction(config: Settings) -> dict[str, float]:
-    """``body_friction`` of a config: factors on the coefficient of friction by part of the body.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    value = plain(config.body_friction)
-    if value is None:
-        return {}
-    if not isinstance(value, dict) or not value:
-        raise ConfigError(f"body_friction={value}: give factors by part, such as body_friction={{left_wrist:3,below_pelvis:0}}")
-    for part, factor in value.items():
-        if isinstance(factor, bool) or not isinstance(factor, (int, float)) or not 0.0 <= factor < math.inf:
-            raise ConfigError(f"body_friction: {part} is {factor!r}; give a finite factor >= 0, 1 for the usual friction")
-    return {str(part): float(factor) for part, factor in value.items()}
-
-
-def with_body_friction(scene: Scene, config: Settings) -> Scene:
-    """The scene whose body grips as the config says; the same where it says nothing.
-
-    Raises:
-        ConfigError: the config has no such table, or there is no body.
-        ValueError: the body has no such part.
-    """
-    parts = checked_friction(config)
-    if not parts:
-        return scene
-    motion = scene.motion
-    if motion.num_vertices == 0:
-        raise ConfigError("body_friction: there is no body; leave it out")
-    grip = np.ones(len(motion.faces))
-    for part, factor in parts.items():
-        try:
-            grip[part_of(motion, part)] = factor
-        except ValueError as error:
-            raise ValueError(f"body_friction: {error}") from error
-    return replace(scene, friction_scale=torch.as_tensor(grip))
 
 
 #: Values of the keys that take numbers.

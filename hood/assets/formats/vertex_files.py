@@ -9,6 +9,7 @@ import math
 import re
 import struct
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -141,7 +142,7 @@ def read_points_folder(folder: Path) -> list[np.ndarray]:
     frames = []
     for path in files:
         check_size(path, SIZE_LIMIT)
-        read = guarded(path, f"{path.suffix[1:].upper()} file", lambda path=path: trimesh.load(path, process=False))
+        read = guarded(path, f"{path.suffix[1:].upper()} file", partial(trimesh.load, path, process=False))
         points = np.asarray(getattr(read, "vertices", np.zeros((0, 3))), dtype=np.float64)
         if not len(points):
             raise ValueError(f"{path}: holds no points")

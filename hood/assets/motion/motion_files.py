@@ -34,6 +34,16 @@ _PARTS = ("train", "validation")
 LISTS = (".json", ".txt", ".csv")
 
 
+def file_named(name: str) -> Path:
+    """The file of an embedded motion, or the one that ``name`` is the path of."""
+    return locate("motions", name)
+
+
+def is_embedded(name: str) -> bool:
+    """Whether a motion of this name comes with the package."""
+    return name in names("motions")
+
+
 def find_motions(entries: Iterable[str], part: str = "train", check: bool = True) -> list[str]:
     """Names and files that ``entries`` stand for, in their order, globs sorted, nothing twice.
 

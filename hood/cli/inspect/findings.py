@@ -18,7 +18,7 @@ from hood.app.settings.overrides import plain_word
 from hood.app.stepping.guarding import summarise_guard
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.contents.objects import mend, take_objects
+from hood.assets.contents.sort_out import mend, take_objects
 from hood.assets.files.atomic import is_occupied
 from hood.assets.files.library import locate
 from hood.assets.files.text import read_indices

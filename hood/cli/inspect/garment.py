@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hood.app.scene.placing import explain_size, find_place_on_mesh
-from hood.assets.contents.objects import Item, items_of, metres_per_unit, num_openings
+from hood.assets.contents.objects import Item, items_of, num_openings
+from hood.assets.contents.sort_out import metres_per_unit
 from hood.assets.fitting.fit_search import AskedFit, FoundFit
 from hood.assets.fitting.placement import LENGTH_UNITS, find_scale, size_ratio, used
 from hood.assets.fitting.suspicions import suspect_place, suspect_sides, way_there

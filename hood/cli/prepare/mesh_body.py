@@ -25,7 +25,7 @@ from hood.app.scene.garments import checked_pins, heed, names_of
 from hood.app.scene.placing import AUTO, asked_keys, explain_size, find_place_on_mesh, keep_place
 from hood.app.settings.compose import ConfigError, plain
 from hood.app.settings.overrides import plain_word
-from hood.assets.contents.objects import take_objects, weld_and_mend
+from hood.assets.contents.sort_out import take_objects, weld_and_mend
 from hood.assets.fitting import alterations
 from hood.assets.fitting.suspicions import suspect_kind, suspect_place, suspect_seams
 from hood.assets.garment.binding import push_out, signed_distances

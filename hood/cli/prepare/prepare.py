@@ -31,7 +31,7 @@ from hood.app.settings.compose import ConfigError, load_config, plain, require_c
 from hood.app.settings.overrides import plain_word
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.contents.objects import take_objects, weld_and_mend
+from hood.assets.contents.sort_out import take_objects, weld_and_mend
 from hood.assets.files.library import locate
 from hood.assets.fitting import alterations
 from hood.assets.fitting.placement import LENGTH_UNITS

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.app.scene.motion import checked_friction
+from hood.app.scene.fabrics import checked_friction
 from hood.app.settings.compose import ConfigError
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.setup import make_scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.app.settings.overrides import overrides
+from hood.app.common import overrides
 from hood.app.settings.rollout_settings import RolloutSettings
 from hood.app.stepping.refinement import chosen, describe_refinement, summarise_refinement
 from hood.cli.main import main

@@ -26,7 +26,8 @@ from garment_kinds import (
 from scipy.spatial import cKDTree
 
 from hood.assets.body.load import load_body
-from hood.assets.contents.objects import items_of, mend, metres_per_unit, take_objects
+from hood.assets.contents.objects import items_of
+from hood.assets.contents.sort_out import mend, metres_per_unit, take_objects
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import Garment, garment_of_mesh
 from hood.assets.garment.record import Fitting, Wanted, start_fitting

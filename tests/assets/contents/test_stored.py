@@ -10,7 +10,7 @@ import pytest
 from garment_kinds import KINDS
 
 from hood.assets.body.load import load_body
-from hood.assets.contents.objects import mend
+from hood.assets.contents.sort_out import mend
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.garment.garment import Garment, checked_garment, garment_of_mesh, load_garment, save_garment
 from hood.assets.garment.outfit import join_garments

@@ -8,9 +8,9 @@ import torch
 from hood.assets.body.body import Body
 from hood.assets.garment.binding import bind_garment
 from hood.assets.garment.garment import Garment
+from hood.assets.garment.mirror import mirror_body, mirror_garment, reflect
 from hood.assets.motion.sequence import PoseSequence
 from hood.mesh import geometry
-from hood.training.scenes import mirror_body, mirror_garment, reflect
 
 BETAS = np.linspace(-2, 2, 10)
 

@@ -14,7 +14,7 @@ from hood.assets.material import Material
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.model.graph.hierarchy import num_passed_over
 from hood.scene.scene import Scene
-from hood.studies.plan.mesh_facts import diameter, reach_facts, reach_sentence, wave_speed
+from hood.studies.plan.plan import diameter, reach_facts, reach_sentence, wave_speed
 from hood.testing import grid
 
 
@@ -59,7 +59,7 @@ def test_schedules_that_reach_so_far_are_named() -> None:
 
 def test_where_fine_levels_are_passed_over_schedules_reach_farther(monkeypatch: pytest.MonkeyPatch) -> None:
     model = {"schedule": "ours", "coarse_edge": 0.04}
-    monkeypatch.setattr("hood.studies.plan.mesh_facts.read_header", lambda path: {"model": json.dumps(model)})
+    monkeypatch.setattr("hood.studies.plan.plan.read_header", lambda path: {"model": json.dumps(model)})
     cloth = sheet(65)  # edges of 19 mm: coarse ones would have 38
     assert num_passed_over(cloth.mean_edge, 0.04) == 1
     assert {one["radius"] for one in reach_facts(cloth, 1 / 30)["models"]} == {96}
