@@ -34,7 +34,7 @@ from fuzz_inputs import Sample, damage, encode, rollout, samples
 
 import hood
 from hood.app.settings.compose import CONFIG_FOLDER
-from hood.cli.inspect.inspect import identify
+from hood.assets.identify import identify
 from hood.testing import cylinder
 
 MEMORY, SECONDS = 2 << 30, 10

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from hood.app.common import load_stepper, overrides
+from hood.app.common import load_stepper
 from hood.app.notices import Bar, Item, collected, tell_how_far
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, output_rate
 from hood.app.plan_file import plan_accuracy, plan_mode, plan_path, planned, rollout_config
 from hood.app.scene.motion import NAMED, Own
 from hood.app.settings.compose import ConfigError
-from hood.app.settings.rollout_settings import measurement
+from hood.app.settings.rollout_settings import measurement, overrides
 from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.app.stepping.guarding import GuardStopped, make_guard

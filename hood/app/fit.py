@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from hood.app.common import output_folder, overrides, prepare_folder
+from hood.app.common import output_folder, prepare_folder
 from hood.app.notices import collected, heard, say
 from hood.app.settings.compose import ConfigError, load_config, named_today, plain, shown
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.app.setup import Setup, check_config, make_stepper, set_up, start_of
 from hood.app.stepping.cautions import idle_in_rollout
 from hood.assets.files.atomic import occupy, write_atomically

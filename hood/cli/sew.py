@@ -17,12 +17,12 @@ from omegaconf import DictConfig
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from hood.app.common import output_folder, overrides, prepare_folder, require_package, split_words
+from hood.app.common import output_folder, prepare_folder, require_package, split_words
 from hood.app.scene.fabrics import most_alike
 from hood.app.scene.garments import FITS, shape_coefficients
 from hood.app.scene.placing import AUTO, arm_angle
 from hood.app.settings.compose import ConfigError, build, load_config, plain, require_choice, shown
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.app.setup import check_config, make_stepper, set_up, start_of
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body

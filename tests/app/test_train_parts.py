@@ -11,8 +11,8 @@ import torch
 from omegaconf import OmegaConf
 from torch.optim.lr_scheduler import CosineAnnealingLR, SequentialLR
 
-from hood.app.common import overrides
 from hood.app.settings.compose import load_config
+from hood.app.settings.rollout_settings import overrides
 from hood.app.train import make_trainer
 from hood.cli.main import main
 from hood.training.callbacks import EarlyStopping

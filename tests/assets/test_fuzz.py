@@ -12,7 +12,7 @@ import pytest
 
 from hood.app.settings.compose import ConfigError, load_config
 from hood.app.settings.record import require_same_config
-from hood.cli.inspect.inspect import identify
+from hood.assets.identify import identify
 from hood.rollouts.file.reader import read_rollout
 
 FUZZ = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"

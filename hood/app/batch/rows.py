@@ -17,8 +17,8 @@ from typing import Any
 from omegaconf import DictConfig
 
 from hood.app.batch.batch import place_motions, require_motions
-from hood.app.common import overrides
 from hood.app.settings.compose import ConfigError, load_config, options, plain, shown
+from hood.app.settings.rollout_settings import overrides
 from hood.assets.files.library import locate, names, unknown
 from hood.assets.files.text import read_text
 from hood.assets.garment.garment import locate_garment

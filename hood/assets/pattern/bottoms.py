@@ -24,7 +24,8 @@ from hood.assets.pattern.blocks import (
     trunk_place,
 )
 from hood.assets.pattern.making import Fold
-from hood.assets.pattern.measures import Choices, Design, Measures, Options, entered
+from hood.assets.pattern.measures import Measures
+from hood.assets.pattern.options import Choices, Design, Options, entered
 from hood.assets.pattern.pattern import Edge, PatternPanel
 from hood.assets.pattern.riding import Patch, button
 

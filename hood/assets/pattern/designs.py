@@ -8,7 +8,8 @@ from typing import Any
 from hood.assets.files.library import nearest, unknown
 from hood.assets.pattern.blocks import Table
 from hood.assets.pattern.bottoms import BOTTOMS
-from hood.assets.pattern.measures import MEANINGS, Design, Measures, Options
+from hood.assets.pattern.measures import Measures
+from hood.assets.pattern.options import MEANINGS, Design, Options
 from hood.assets.pattern.pattern import MOST_GATHERED, Pattern, check_pattern
 from hood.assets.pattern.tops import TOPS
 

@@ -24,7 +24,8 @@ from hood.assets.pattern.blocks import (
 )
 from hood.assets.pattern.bottoms import gore_waist, gores, leg_waist
 from hood.assets.pattern.fronts import lapels, open_front, quilted, ribbed, stand, turned_collar
-from hood.assets.pattern.measures import Choices, Design, Measures, Options, entered
+from hood.assets.pattern.measures import Measures
+from hood.assets.pattern.options import Choices, Design, Options, entered
 
 #: Every design here by name.
 TOPS: dict[str, Design] = {}

@@ -1,21 +1,17 @@
 """``hood inspect FILE …``: what files are, what is wrong with them, how to repair it, and whether they fit together.
 
 What ``hood inspect`` says of a motion: its layout, people, frame rate, unit and up axis, and which of these are assumed.
-
-The kind of a file (garment, body, motion, rollout, …), from its name and its keys.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import zipfile
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
@@ -28,22 +24,13 @@ from hood.app.settings.overrides import plain_word
 from hood.assets import identify as kinds
 from hood.assets.body.body import Body
 from hood.assets.body.load import load_body
-from hood.assets.files.guarded import guarded, listed, own_group
-from hood.assets.files.library import RENAMED, locate, names, nearest, require_readable
+from hood.assets.files.library import locate
 from hood.assets.files.said import Doubt
-from hood.assets.formats.gltf import read_gltf
-from hood.assets.formats.mesh_file import mesh_suffixes, split_object
-from hood.assets.formats.usd import USD_SUFFIXES, moves
-from hood.assets.formats.vertex_files import CACHE_SUFFIXES
-from hood.assets.garment.reference_garments import garment_names
 from hood.assets.motion.animated_mesh import NO_BODY, body_kind
-from hood.assets.motion.layouts.content import PICKLES, TENSORS, plain_content, read_content
 from hood.assets.motion.layouts.people import SeveralPeopleError
-from hood.assets.motion.layouts.read import is_of_motion
 from hood.assets.motion.load import find_bearing, find_up
-from hood.assets.motion.recording import Recording, motion_suffixes, read_recording
+from hood.assets.motion.recording import Recording, read_recording
 from hood.assets.motion.skeleton import UP_AXES, require_up
-from hood.assets.pickles.content import load_content
 from hood.cli.inspect import findings
 from hood.cli.inspect.findings import Finding
 from hood.scene.body_motion.load import NO_MOTION, MotionOptions, load_motion
@@ -329,100 +316,3 @@ def _show(value: Any) -> str:
         return str(value)
     rest = [f"… and {len(value) - _MOST_SHOWN} more"] if len(value) > _MOST_SHOWN else []
     return ", ".join([*map(_show, value[:_MOST_SHOWN]), *rest]) or "none"
-
-
-GARMENT, BODY, MOTION, MOVING_MESH = "garment", "body model", "motion", "moving mesh"
-CHECKPOINT, ROLLOUT, REFERENCE_ROLLOUT, VERTEX_LIST = "checkpoint", "rollout", "rollout of the reference", "vertex list"
-_CHECKPOINTS = (".safetensors", ".ckpt")
-_EMBEDDED = {"garments": GARMENT, "motions": MOTION, "body": BODY, "weights": CHECKPOINT}
-_KEYS = {
-    GARMENT: ({"rest_pos", "faces"}, {"vertices", "faces", "coarse_edges"}),
-    BODY: ({"v_template", "weights"},),
-    MOTION: ({"poses"}, {"root_orient"}, {"global_orient"}, {"pose", "translation"}),
-    REFERENCE_ROLLOUT: ({"pred", "cloth_faces"},),
-    MOVING_MESH: ({"verts", "faces"}, {"vertices", "faces"}, {"verts", "f"}),
-}
-
-
-def identify(name: str) -> str:
-    """The kind of an embedded name or a file.
-
-    Raises:
-        FileNotFoundError: neither an embedded name nor a file.
-        ValueError: unreadable, or of a kind that nothing here reads; says what was found in it.
-    """
-    for folder, kind in _EMBEDDED.items():
-        if name in names(folder) or name in RENAMED.get(folder, {}):
-            return kind
-    head, colon, _ = name.rpartition(":")
-    path = Path(head).expanduser() if colon and head.lower().endswith(".pkl") else split_object(name)[0]
-    if not path.exists():
-        near = nearest(name, [known for folder in _EMBEDDED for known in names(folder)])
-        hint = f"; did you mean {near}?" if near else ""
-        raise FileNotFoundError(f"{path}: no such file, and no embedded asset of that name{hint}")
-    if path.is_dir():
-        return MOVING_MESH if body_kind(path) == "mesh" else BODY
-    require_readable(path, "file")
-    suffix = path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
-        gltf = read_gltf(path)
-        return MOVING_MESH if gltf.items("animations") or gltf.items("skins") else GARMENT
-    if suffix in USD_SUFFIXES:
-        return MOVING_MESH if moves(path) else GARMENT
-    if suffix in CACHE_SUFFIXES:
-        return MOVING_MESH
-    if suffix in mesh_suffixes():
-        return GARMENT
-    if suffix in _CHECKPOINTS:
-        return CHECKPOINT
-    if suffix in TENSORS:
-        return MOTION if _is_torch_motion(path) else CHECKPOINT
-    if suffix in (".txt", ".json"):
-        return VERTEX_LIST
-    if suffix in (".h5", ".hdf5"):
-        return guarded(path, "HDF5 file", lambda: _h5_kind(path))
-    if suffix == ".npz":
-        keys = guarded(path, "NumPy archive", lambda: _archive_keys(path))
-        return _kind_of_keys(keys) or _kind_of_content(path, read_content(path), keys)
-    if suffix in PICKLES:
-        content = load_content(path)
-        if garment_names(content):
-            return GARMENT
-        keys = [str(key) for key in content] if isinstance(content, dict) else []
-        return _kind_of_keys(keys) or _kind_of_content(path, plain_content(content), keys)
-    if suffix in motion_suffixes():
-        return MOTION
-    kind = f"unknown file type {path.suffix!r}" if path.suffix else "its name has no ending, such as .obj or .npz"
-    raise ValueError(f"{path}: {kind}; convert or rename it, docs/files.md lists what is read")
-
-
-def _kind_of_keys(keys: Collection[str]) -> str | None:
-    fitting = (kind for kind, alternatives in _KEYS.items() if any(needed <= set(keys) for needed in alternatives))
-    return next(fitting, None)
-
-
-def _is_torch_motion(path: Path) -> bool:
-    """Whether a file of torch holds a motion; what cannot be read is left to the reader of checkpoints."""
-    try:
-        return is_of_motion(path, read_content(path))
-    except ValueError:
-        return False
-
-
-def _kind_of_content(path: Path, content: Any, keys: Collection[str]) -> str:
-    """A motion may stand deeper in a file, or under keys of other layouts."""
-    if is_of_motion(path, content):
-        return MOTION
-    raise ValueError(f"{path}: no garment, body, motion or mesh has the keys {listed(sorted(keys))}")
-
-
-def _archive_keys(path: Path) -> list[str]:
-    with zipfile.ZipFile(path) as archive:
-        return [name.removesuffix(".npy") for name in archive.namelist()]
-
-
-def _h5_kind(path: Path) -> str:
-    with h5py.File(path, "r") as file:
-        cloth = own_group(file, "cloth")
-        known = cloth is not None and any(cloth.get(name, getlink=True) is not None for name in ("pos", "steps"))
-        return ROLLOUT if known else MOVING_MESH

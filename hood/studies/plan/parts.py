@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from hood.app.common import overrides
 from hood.app.settings.compose import ConfigError, plain
-from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, fixed_shapes, with_value
+from hood.app.settings.rollout_settings import RolloutSettings, cloth_contact, fixed_shapes, overrides, with_value
 from hood.app.stepping.cloth_contact import acts
 from hood.app.stepping.refinement import chosen
 from hood.app.stepping.steppers import losses_of

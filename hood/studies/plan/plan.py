@@ -26,12 +26,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from hood import __version__
 from hood.app.common import held_folder, output_folder
-from hood.app.common import overrides as overrides_of
 from hood.app.notices import say
 from hood.app.plan_file import FREE, content_digest, key_of, plan_accuracy, read_plan, write_plan
 from hood.app.settings.compose import ConfigError, load_config, named_today, plain, with_words
 from hood.app.settings.overrides import plain_word
 from hood.app.settings.rollout_settings import RolloutSettings, fixed_shapes
+from hood.app.settings.rollout_settings import overrides as overrides_of
 from hood.app.setup import Setup, check_config, make_stepper, set_up
 from hood.app.stepping.cloth_contact import acts, why_not
 from hood.assets.files.library import locate, names

@@ -25,9 +25,8 @@ from hood.app.batch.dress import _frames_of
 from hood.app.batch.manifest import Manifest, own_line, parquet_columns, read_manifest
 from hood.app.batch.rows import DataRow, row_seed, rows_of
 from hood.app.batch.work import Call, HopelessError, pull, settings_of
-from hood.app.common import overrides
 from hood.app.settings.compose import ConfigError, load_config
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.cli.main import main
 from hood.media.film import Film
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from hood.app.common import overrides
 from hood.app.scene.garments import checked_sizes, cut_to_size, describe_ease, summarise_ease
 from hood.app.scene.motion import make_motion
 from hood.app.settings.compose import ConfigError, build
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.parts import lengths_of
 from hood.energies.damping import BendDamping, StretchDamping

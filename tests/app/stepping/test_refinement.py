@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.app.common import overrides
-from hood.app.settings.rollout_settings import RolloutSettings
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.app.stepping.refinement import chosen, describe_refinement, summarise_refinement
 from hood.cli.main import main
 from hood.rollouts.file.reader import read_rollout

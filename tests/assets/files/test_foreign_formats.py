@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from hood.assets.files.library import locate
+from hood.assets.identify import identify
 from hood.assets.motion.animated_mesh import body_kind
-from hood.cli.inspect.inspect import identify
 
 FOREIGN = ("fbx", "bvh", "dae", "blend", "max", "mb", "ma")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hood.assets.files.guarded import first_line, guarded, listed
-from hood.cli.inspect.inspect import identify
+from hood.assets.identify import identify
 
 
 @pytest.mark.parametrize("said", ["x" * 9000, "first\n" + "x" * 9000])

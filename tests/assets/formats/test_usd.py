@@ -11,8 +11,8 @@ import pytest
 from hood.assets.formats import usd
 from hood.assets.formats.mesh_file import read_mesh_file
 from hood.assets.formats.usd import read_usd_animation
+from hood.assets.identify import GARMENT, MOVING_MESH, identify
 from hood.assets.motion.animated_mesh import body_kind, load_mesh_sequence
-from hood.cli.inspect.inspect import GARMENT, MOVING_MESH, identify
 
 pytest.importorskip("pxr", reason="usd-core has no wheel for this machine")
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt

@@ -10,7 +10,8 @@ import pytest
 
 from hood.assets.body.body import Body
 from hood.assets.pattern.designs import DESIGNS, draft
-from hood.assets.pattern.measures import MEANINGS, Measures, measure_body
+from hood.assets.pattern.measures import Measures, measure_body
+from hood.assets.pattern.options import MEANINGS
 from hood.assets.pattern.pattern import Pattern, check_pattern, read_pattern, write_pattern
 from hood.assets.pattern.sheet import sheet_of
 from hood.mesh import topology

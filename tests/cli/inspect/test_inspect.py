@@ -17,7 +17,7 @@ from workshop import write_obj
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment
-from hood.cli.inspect.inspect import identify
+from hood.assets.identify import identify
 from hood.cli.main import main
 
 

@@ -15,7 +15,7 @@ from motion_kinds.variants import GENERATORS
 from motion_kinds.walks import world
 from motion_kinds.writers import write
 
-from hood.cli.inspect.inspect import CHECKPOINT, MOTION, identify
+from hood.assets.identify import CHECKPOINT, MOTION, identify
 from hood.cli.main import main
 
 
