@@ -35,8 +35,7 @@ from hood.steppers.static_shapes.cuda_graph import count_operations, trace
 from hood.steppers.static_shapes.newton_pieces import NewtonFrame
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import FixedStep, first_capacity
-from hood.tensors.dense import whole_arrays
-from hood.tensors.precision import assumed
+from hood.tensors.dense import assumed, whole_arrays
 
 #: Kernels of an operator that has not one, and how often they read and write what the operator is given.
 STEPS = frame_settings().cg_iterations

@@ -50,8 +50,7 @@ from hood.steppers.static_shapes.cuda_graph import trace
 from hood.steppers.static_shapes.newton import CapturedNewton
 from hood.steppers.static_shapes.problem import settled_potential, step_inputs
 from hood.steppers.static_shapes.simulator import CapturedSimulator, FixedStep, first_capacity
-from hood.tensors.dense import whole_arrays
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton, whole_arrays
 from hood.testing import without_values
 
 SWITCH = "HOOD_TRITON"

@@ -60,8 +60,7 @@ from hood.model.graph.hierarchy import build_hierarchy
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.model.network.model import MeshGraphNet
-from hood.tensors.dense import affine
-from hood.tensors.precision import PRECISIONS
+from hood.tensors.dense import PRECISIONS, affine
 from hood.testing import grid, plane_contact
 
 NUM_BODY = 6890

@@ -24,7 +24,7 @@ _HOMES = {
     "differentiable": "hood.api",
     "fit": "hood.app.fit",
     "export": "hood.api",
-    "view": "hood.api",
+    "view": "hood.app.output.view",
     "train": "hood.api",
     "load_model": "hood.api",
     "load_garment": "hood.assets.garment.garment",

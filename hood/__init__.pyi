@@ -7,9 +7,9 @@ from hood.api import (
     rollout as rollout,
     simulate as simulate,
     train as train,
-    view as view,
 )
 from hood.app.fit import fit as fit
+from hood.app.output.view import view as view
 from hood.assets.body.body import Body as Body
 from hood.assets.body.load import load_body as load_body
 from hood.assets.garment.garment import Garment as Garment, load_garment as load_garment

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,9 +42,6 @@ from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import NewtonStepper, Stepper, require_stepper
 from hood.tensors.batch import to_device
-
-if TYPE_CHECKING:
-    from hood.app.output.view import Page
 
 
 class Simulation:
@@ -335,30 +332,6 @@ def export(rollout: str | Path, *, tell: Callable[[str], None] | None = None, **
         for line in said:
             tell(line)
     return target
-
-
-def view(*rollouts: str | Path, **keys: Any) -> Page:
-    """The page of ``hood view``: up to four rollouts to turn and play, in a notebook where it is the value of a cell.
-
-    Args:
-        rollouts: their ``rollout.h5``, or the folders of them.
-        keys: those of ``hood view --help``, such as ``num_frames=30``.
-
-    Returns:
-        The page; ``save("view.html")`` writes it.
-
-    Raises:
-        ValueError, OSError: keys or files that cannot be used.
-
-    Examples:
-        >>> import hood
-        >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
-        >>> hood.view("outputs/tank").save("tank.html").name
-        'tank.html'
-    """
-    from hood.app.output.view import viewer_page
-
-    return viewer_page([*(str(Path(rollout)) for rollout in rollouts), *overrides(keys)])
 
 
 def dress(*, tell: Callable[[str], None] | None = None, **keys: Any) -> dict[str, dict[str, Any]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hood.assets.formats.image import read_texture
+from hood.assets.formats.raw_mesh import read_texture
 from hood.media.film import Film
 from hood.media.pieces import pieces_of
 from hood.media.video import save_png

@@ -86,6 +86,17 @@ MODULES = {
     "tools/assets/makehuman.py": "run once; one function a step of the body, a motion or a cut",
     "tools/assets/recipes.py": "run once; one function a step of the body, a motion or a cut",
     "tools/assets/patterns.py": "run once; one function a step of the body, a motion or a cut",
+    "hood/app/scene/garments.py": "garments of a command: read, held, cut to size, and what is said of that",
+    "hood/app/settings/rollout_settings.py": "the keys of a rollout with their types, and Python values as their words",
+    "hood/assets/motion/layouts/read.py": "one table of layouts, and the sentences for what is none of them",
+    "hood/assets/pickles/records.py": "one reader of pickles: its list of stand-ins, and the arrays they become",
+    "hood/cli/sew.py": "two commands that make a garment and show how it sits",
+    "hood/media/exports/sequences.py": "every format of a mesh and its frames: OBJ, PLY, PC2, MDD",
+    "hood/steppers/newton.py": "the protocol of steppers, and the solver as one of them",
+    "hood/studies/envelope/page.py": "one map, as a page and as a section of a document",
+    "hood/studies/plan/page.py": "one plan, as a table and as a page",
+    "hood/studies/plan/plan.py": "one plan from its words to its file",
+    "hood/tensors/dense.py": "products of tall arrays by several libraries, and the precision that they are computed in",
 }
 FUNCTIONS = {
     "hood.rollouts.loop.simulate": "the loop reads in the order of a frame; its arguments and what they mean are a third of it",

@@ -25,7 +25,7 @@ from hood.steppers.checkpoint import load_simulator
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper
 from hood.steppers.published import SUFFIXES, load_reference_checkpoint
-from hood.tensors.precision import check_precision
+from hood.tensors.dense import check_precision
 from hood.training import distributed
 
 Result = TypeVar("Result")

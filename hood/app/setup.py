@@ -51,7 +51,7 @@ from hood.steppers.newton import Stepper
 from hood.steppers.static_shapes.cuda_graph import has_graphs
 from hood.steppers.static_shapes.simulator import MODES, CapturedSimulator, network_of
 from hood.steppers.watched import WatchedStepper
-from hood.tensors.precision import PRECISIONS, TF32
+from hood.tensors.dense import PRECISIONS, TF32
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from hood.app.settings.record import read_record, read_words
 from hood.app.sweep import REASON, state_of
 from hood.app.train import last_record
 from hood.assets.files.atomic import write_atomically
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.evaluation.files import fixed_width, write_rows
 from hood.rollouts.file.reader import RolloutData
 

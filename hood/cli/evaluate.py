@@ -53,7 +53,7 @@ from hood.rollouts.frames import KeptFrames
 from hood.scene.scene import Scene, build_scene
 from hood.steppers.ranges import Conditions, scene_conditions
 from hood.steppers.refined import METHODS
-from hood.tensors.precision import check_precision
+from hood.tensors.dense import check_precision
 from hood.training import distributed
 
 

@@ -103,7 +103,7 @@ def _paths(config: DictConfig) -> tuple[Path, Path]:
     return source, target
 
 
-def view(arguments: Sequence[str]) -> int:
+def write_page(arguments: Sequence[str]) -> int:
     """Run the command ``view``; returns the exit code."""
     page = viewer_page(arguments)
     size, target = len(page.text.encode()), page.save()

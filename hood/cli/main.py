@@ -51,7 +51,7 @@ COMMANDS = {
 _HOMES = {
     "rollout": "hood.cli.rollout:run",
     "dress": "hood.cli.rollout:dressed",
-    "view": "hood.cli.export:view",
+    "view": "hood.cli.export:write_page",
     "compare": "hood.cli.compare:run",
     "export": "hood.cli.export:run",
     "inspect": "hood.cli.inspect.inspect:run",

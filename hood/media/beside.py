@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hood.assets.files.said import install
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.film import Film, seconds_per_frame, sheet_frames
 from hood.media.video import VideoWriter
 from hood.rollouts.file.reader import RolloutData

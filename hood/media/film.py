@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.colouring import colouring_of
 from hood.media.pieces import between_hems, layer_distances, looks_of, pieces_of
 from hood.media.renderer.render import (

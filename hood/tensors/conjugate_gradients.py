@@ -18,8 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hood.tensors.dense import sum_scenes
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton, sum_scenes
 
 #: Rows of a tile, partial sums that are read at once, and warps of a program.
 TILE, CHUNK, WARPS = 64, 128, 2

@@ -25,7 +25,7 @@ from hood.steppers.protocol import Stopwatch, timed
 from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
 from hood.steppers.static_shapes.problem import altered, problem_from, settled_potential, step_inputs, step_shape
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
-from hood.tensors.precision import products
+from hood.tensors.dense import products
 from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
 from hood.training.optimiser import can_be_taken_back
 from hood.training.outcome import TOLD, Acceptance, Figures, Signal, Update, figures_of, outcome_of

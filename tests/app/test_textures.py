@@ -12,7 +12,7 @@ from PIL import Image
 from test_export import DT, FACES, FRAMES, UV, UV_FACES, _glb, _rollout
 from test_view import content
 
-from hood.assets.formats import image as texture_module
+from hood.assets.formats import raw_mesh as texture_module
 from hood.cli.main import main
 from hood.media.viewer.page import unpack_integers
 from hood.rollouts.file.reader import read_rollout

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.film import Film, drawn
 from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, grid, sphere

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.formats import image as texture_module
-from hood.assets.formats.image import Texture, read_texture
+from hood.assets.formats import raw_mesh as texture_module
+from hood.assets.formats.raw_mesh import Texture, read_texture
 from hood.media.pieces import pieces_of, split_seams
 from hood.media.renderer import raster, render, shading
 from hood.media.renderer import raster as drawing

@@ -14,7 +14,7 @@ from torch import Tensor
 from hood.solver.system.linear import invert_blocks
 from hood.solver.system.sparsity import BlockPattern
 from hood.tensors import conjugate_gradients as block_cg
-from hood.tensors.precision import assumed
+from hood.tensors.dense import assumed
 from tests.interpreted import interpret
 
 #: Rows of the scenes, shift of the second half of the scenes' matrices (negative: indefinite), iterations, number.

@@ -19,7 +19,7 @@ from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.static_shapes import Capacity
 from hood.steppers.network import NetworkStepper, build_simulator
 from hood.steppers.static_shapes.cuda_graph import trace
-from hood.tensors.precision import assumed
+from hood.tensors.dense import assumed
 from hood.training import updates
 from hood.training.curriculum import CollisionRamp, Horizon, WarmupCosine
 from hood.training.outcome import Figures, Signal, StartedUpdate, Update, read_figures

@@ -21,7 +21,7 @@ from hood.app.settings.compose import ConfigError, plain, require_choice, shown
 from hood.app.settings.rollout_settings import Settings
 from hood.assets.files.atomic import write_atomically
 from hood.assets.files.library import unknown
-from hood.assets.formats.image import Texture, read_texture
+from hood.assets.formats.raw_mesh import Texture, read_texture
 from hood.assets.formats.usd import NO_USD, has_usd
 from hood.assets.garment.garment import Garment
 from hood.media.exports.scene_files import gltf_bytes, image_name, write_usd

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
 from hood.app.common import frame_count, output_folder, short_names, split_words
 from hood.app.output.export import lay_on, read_checked, read_textures
 from hood.app.settings.compose import ConfigError
+from hood.app.settings.rollout_settings import overrides
 from hood.assets.files.atomic import write_atomically
 from hood.rollouts.file.reader import RolloutData
 
@@ -44,6 +46,28 @@ class Page:
         """The page inside that of a notebook."""
         style = f"width:100%;height:{_HEIGHT}px;border:0"
         return f'<iframe title="hood view" style="{style}" srcdoc="{escape(self.text, quote=True)}"></iframe>'
+
+
+def view(*rollouts: str | Path, **keys: Any) -> Page:
+    """The page of ``hood view``: up to four rollouts to turn and play, in a notebook where it is the value of a cell.
+
+    Args:
+        rollouts: their ``rollout.h5``, or the folders of them.
+        keys: those of ``hood view --help``, such as ``num_frames=30``.
+
+    Returns:
+        The page; ``save("view.html")`` writes it.
+
+    Raises:
+        ValueError, OSError: keys or files that cannot be used.
+
+    Examples:
+        >>> import hood
+        >>> _ = hood.rollout(garment="tank", num_frames=3, video="none", output="outputs/tank")
+        >>> hood.view("outputs/tank").save("tank.html").name
+        'tank.html'
+    """
+    return viewer_page([*(str(Path(rollout)) for rollout in rollouts), *overrides(keys)])
 
 
 def viewer_page(arguments: Sequence[str]) -> Page:

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from hood.assets.body.body import JOINTS, Body
 from hood.assets.files.library import unknown
 from hood.assets.files.text import meant, read_indices
-from hood.assets.formats.image import read_texture
+from hood.assets.formats.raw_mesh import read_texture
 from hood.assets.garment.garment import Garment
 from hood.assets.garment.pins import REGIONS, region_loop
 from hood.mesh.flat import followed, laid_out, stretched_sides

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.exports.sequences import Clip, ClipPart
 from hood.media.pieces import split_seams
 

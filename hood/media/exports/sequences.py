@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 
 from hood.assets.files.atomic import write_atomically
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.assets.garment.garment import Garment
 from hood.media.pieces import looks_of, pieces_of
 from hood.media.renderer.render import BODY_COLOR

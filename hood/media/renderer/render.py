@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from hood.assets.files.said import install
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.renderer.raster import (
     Camera,
     SeenValues,

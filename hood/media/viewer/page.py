@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.colouring import COLOURINGS, Colouring, colouring_of, colours_at
 from hood.media.film import seconds_per_frame
 from hood.media.pieces import hideable_parts, looks_of, pieces_of, split_seams

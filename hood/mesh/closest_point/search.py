@@ -20,8 +20,7 @@ from torch import Tensor
 from hood.mesh import topology
 from hood.mesh.closest_point import tree as surface_tree
 from hood.mesh.closest_point.vertices import nearest_three
-from hood.tensors.dense import sum_scenes
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton, sum_scenes
 
 NUM_NEAREST = 3
 #: Scenes up to this many faces, and faces with an edge longer than this many mean edges, are tested

@@ -24,8 +24,7 @@ from hood.mesh.closest_point.search import (
 )
 from hood.mesh.closest_point.vertices import nearest_three
 from hood.tensors.batch import gather_true
-from hood.tensors.dense import at_once, sum_scenes
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import at_once, has_triton, sum_scenes
 
 
 @torch.no_grad()

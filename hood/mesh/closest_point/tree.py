@@ -337,13 +337,8 @@ def moved(start: np.ndarray, end: np.ndarray) -> tuple[float, float] | None:
 
 @torch.no_grad()
 def vertex_skin(vertices: Tensor, faces: Tensor, incidence: Sequence[Tensor], curved: bool) -> tuple[Tensor, Tensor] | None:
-    """Unit normals (W, 3) and curvatures [1/m] (W,) of a surface at its vertices (W, 3), on a CPU, as
-    :mod:`hood.mesh.geometry` has them; curvatures of 0 unless it is to be ``curved``. None without a compiler.
-
-    Args:
-        faces: (G, 3).
-        incidence: :attr:`hood.mesh.closest_point.search.Incidence.adjacency` of ``faces``.
-    """
+    """Unit normals (W, 3) and curvatures [1/m] (W,), 0 unless it is to be ``curved``, of a surface at its vertices (W, 3), on a
+    CPU, as :mod:`hood.mesh.geometry` has them; None without a compiler. ``incidence``: the adjacency of ``faces`` (G, 3)."""
     lib = library() if vertices.device.type == "cpu" else None
     if lib is None:
         return None
@@ -353,9 +348,8 @@ def vertex_skin(vertices: Tensor, faces: Tensor, incidence: Sequence[Tensor], cu
         made["skin"] = [np.ascontiguousarray(table, np.int64) for table in tables]
     count = len(vertices)
     normals, of_face, curvature = np.empty((count, 3)), np.empty(len(faces)), np.empty(count)
-    arrays = *made["skin"], _double(vertices), normals, of_face, curvature
     counts = len(faces), len(made["skin"][1]) if curved else 0, count
-    pointers = (POINTER(array.ctypes.data) for array in arrays)
+    pointers = (POINTER(array.ctypes.data) for array in (*made["skin"], _double(vertices), normals, of_face, curvature))
     lib.surface_curvature(*map(COUNT, counts), *pointers, REAL(MOST_CURVATURE), COUNT(ROUNDS if curved else 0))
     return torch.from_numpy(normals), torch.from_numpy(curvature)
 

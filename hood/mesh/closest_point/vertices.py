@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from hood.mesh import geometry
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton
 
 #: Pairs evaluated at once on an accelerator: bounds the memory.
 _CHUNK_PAIRS = 4_000_000

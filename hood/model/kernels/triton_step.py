@@ -26,8 +26,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hood.model.graph.builder import EdgeSet, Subset
-from hood.tensors.dense import linear
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton, linear
 
 if TYPE_CHECKING:
     from hood.model.network.message_passing import ProcessorStep
@@ -45,7 +44,7 @@ INPUT_PRECISIONS = ("ieee", "tf32x3", "tf32")
 
 def applies(width: int, dtype: torch.dtype, device: torch.device) -> bool:
     """Whether networks with latents (N, ``width``) of ``dtype`` go this way: on a CUDA device, float32 or bfloat16, a multiple
-    of 16 up to :data:`WIDEST`, where :func:`hood.tensors.precision.has_triton` says so."""
+    of 16 up to :data:`WIDEST`, where :func:`hood.tensors.dense.has_triton` says so."""
     return width % 16 == 0 and width <= WIDEST.get(dtype, 0) and has_triton(device)
 
 

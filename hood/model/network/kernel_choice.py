@@ -27,7 +27,7 @@ from hood.model.kernels.block import KERNELS, check_kernels
 from hood.model.network.model import MeshGraphNet
 from hood.native.build import BuildError, cache_folder, find_compiler, processor, source_text
 from hood.tensors import dense
-from hood.tensors.precision import PRECISIONS
+from hood.tensors.dense import PRECISIONS
 
 #: Instead of a form's name.
 AUTO = "auto"

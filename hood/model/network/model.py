@@ -29,9 +29,8 @@ from hood.model.kernels import network
 from hood.model.kernels.block import check_kernels
 from hood.model.network.message_passing import EdgeDecoder, ProcessorStep
 from hood.model.network.mlp import MLP
-from hood.tensors.dense import pad_rows
-from hood.tensors.precision import PRECISIONS as PRECISIONS
-from hood.tensors.precision import check_precision, products
+from hood.tensors.dense import PRECISIONS as PRECISIONS
+from hood.tensors.dense import check_precision, pad_rows, products
 
 #: By class what its parts are, alone or in lists and tables.
 _CLASSES: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {

@@ -31,8 +31,7 @@ from hood.steppers.static_shapes.problem import (
     step_shape,
     with_fixed_contact,
 )
-from hood.tensors.dense import whole_arrays
-from hood.tensors.precision import has_triton
+from hood.tensors.dense import has_triton, whole_arrays
 
 if TYPE_CHECKING:
     from hood.steppers.newton import NewtonStepper

@@ -38,7 +38,7 @@ from hood.steppers.static_shapes.problem import (
     step_shape,
     with_fixed_contact,
 )
-from hood.tensors.precision import check_precision, products
+from hood.tensors.dense import check_precision, products
 
 
 class StepResult(NamedTuple):

@@ -41,7 +41,7 @@ from hood.studies.tradeoff.comparison import Study, pareto_front
 from hood.studies.tradeoff.grid import Grid, GridSize, Point, listed_words
 from hood.studies.tradeoff.points import Failure, Points
 from hood.studies.tradeoff.results import Reached, overstretched, read_measured, read_reached, refinement_tables
-from hood.tensors.precision import PRECISIONS, TF32, check_precision
+from hood.tensors.dense import PRECISIONS, TF32, check_precision
 
 #: Keys of ``hood evaluate`` that every point sets by itself.
 _OWN = (

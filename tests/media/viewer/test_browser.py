@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hood.assets.formats.image import Texture
+from hood.assets.formats.raw_mesh import Texture
 from hood.media.renderer.raster import Camera
 from hood.media.renderer.render import RenderMesh, render_frame
 from hood.media.viewer.page import view_page

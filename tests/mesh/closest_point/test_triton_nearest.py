@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hood.mesh.closest_point import static_shapes, vertices
-from hood.tensors.precision import assumed
+from hood.tensors.dense import assumed
 from tests.interpreted import interpret
 from tests.spills import CAPABILITIES, LEAST, spilled
 

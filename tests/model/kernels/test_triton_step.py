@@ -23,9 +23,8 @@ from hood.model.kernels import triton_step
 from hood.model.network.message_passing import ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.steppers.static_shapes.cuda_graph import VIEWS
-from hood.tensors import precision as triton_device
-from hood.tensors.dense import whole_arrays
-from hood.tensors.precision import assumed, products
+from hood.tensors import dense as triton_device
+from hood.tensors.dense import assumed, products, whole_arrays
 from tests.interpreted import interpret
 
 TILE = 32  # of the widest tiles

@@ -10,7 +10,7 @@ import torch
 from hood.app.common import warn_if_slow
 from hood.model.kernels import block
 from hood.model.network.model import MeshGraphNet
-from hood.tensors.precision import check_precision, products
+from hood.tensors.dense import check_precision, products
 
 SWITCH = torch.backends.cuda.matmul
 
