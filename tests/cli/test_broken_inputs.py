@@ -26,7 +26,7 @@ def write(path: str, text: str = "") -> Callable[[], object]:
 BROKEN: dict[str, tuple[list[str], tuple[str, ...], Callable[[], object] | None]] = {
     "no video": (
         ["rollout", "video=false"],
-        ("video=false: give text or a list in brackets, such as video=mp4", "mp4, gif or none"),
+        ("video=false: give text or a list in brackets, such as video=mp4", "mp4, gif or none; png"),
         None,
     ),
     "frames of no video": (

@@ -60,6 +60,7 @@ RUN = (
     Run(r"events_picture\.py", "", "", (r"rollout\.h5 docs/images/", "long.h5 ")),
     Run(r"extremes\.py", "--side 9 --frames 1", r"\| × 100 \| × 0\.1 \|"),
     Run(r"fabrics\.py", "", r"below_waistband"),
+    Run(r"film\.py", "--rounds 1 --frames 2", r"s of processor", (r"outputs/dance", "long.h5")),
     Run(r"frame\.py", "--sizes 300 --models fine15 --precision fp32 --frames 3", r"\| fine15 \| torch \| fp32 \|"),
     Run(r"fuzz\.py", "--count 3", r"\| all \| 3 \|", slow=True),
     Run(r"guard\.py", "--garments tank --motions plie --steppers newton --frames 3", r"alarms 0, repairs 0 of 2"),
@@ -93,6 +94,7 @@ RUN = (
     ),
     Run(r"scaling\.py report", "", r"γ median"),
     Run(r"cut_pieces\.py", "", r"skirt_front\.npz: 4719 vertices(.|\n)*skirt_front_fine\.npz: 4519 vertices"),
+    Run(r"gradient_errors\.py", "--cases 1", r"covered: \d of 1 cases"),
     Run(r"gradients\.py", "--garments tank --steps 2 --rounds 1 --memory-steps 2", r"tank +1016 +\d"),
     Run(r"preconditioners\.py$", "--frames 7", r"tank +\d.*×", (r"$", " tank")),
     Run(r"preconditioners\.py dress", "", "", (r"dress.*", "tank --frames 7")),
@@ -116,6 +118,7 @@ RUN = (
 #: Lines that are not run, and why; what they call has tests elsewhere.
 NOT_RUN = {
     r"build_assets\.py": "writes the data of the package anew, with packages from PyPI; tests/tools/assets tests that",
+    r"/fit\.py": "fits for minutes; tests/app/test_fit.py does so in small",
     r"folds\.py": "sews garments and simulates them for minutes each",
     r"gallery\.py": "17 rollouts of 60 frames at 4,000 vertices",
     r"gpu(_checks)?\.py": "needs a CUDA device",

@@ -70,7 +70,7 @@ def test_names_that_look_like_numbers_are_names() -> None:
         (["sheet=3"], ("sheet=3: give true or false, such as sheet=true",)),
         (
             ["video=false"],
-            ("such as video=mp4; hood rollout --help says of video: mp4, gif or none; [mp4,3] draws every third",),
+            ("such as video=mp4; hood rollout --help says of video: mp4, gif or none; png: transparent",),
         ),
         (["sequence=null"], ("sequence=null: give text, such as sequence=walk_proud",)),
         (["sequence=[walk_proud,plie]"], ("give one text, not a list", "a list file")),

@@ -17,9 +17,9 @@ from motion_kinds.writers import write
 from scipy.spatial.transform import Rotation
 
 from hood.assets.files.said import Doubt
+from hood.assets.identify import MOTION, identify
 from hood.assets.motion.load import bearing_notice, load_sequence
 from hood.assets.motion.recording import read_recording
-from hood.cli.inspect.inspect import MOTION, identify
 
 
 @pytest.mark.parametrize("name", GENERATORS)
