@@ -23,5 +23,5 @@ def test_inside_blender(cases: str) -> None:
     command = [str(PYTHON), "-m", "pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", "-o", "python_files=case_*.py"]
     command += ["--rootdir", str(INSIDE), "--confcutdir", str(INSIDE), str(INSIDE / cases)]
     environment = os.environ | {"HOOD_PYTHON": sys.executable}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=1800)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]

@@ -15,6 +15,20 @@ sys.path[:0] = [str(ROOT / "blender"), str(Path(__file__).parent)]
 
 #: Preferences of the add-on, which has none here because Blender has not installed it.
 PREFERENCES = {"program": ""}
+_ENDED: list[int] = []
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    _ENDED.append(int(exitstatus))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End at once: bpy's own threads sometimes wait for each other while the process is taken down."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if _ENDED:
+        os._exit(_ENDED[-1])
 
 
 @pytest.fixture(scope="session", autouse=True)
