@@ -312,14 +312,5 @@ _CLASSES = (
     HOOD_OT_install,
 )
 
-
-def register() -> None:
-    """Make them known."""
-    for one in _CLASSES:
-        bpy.utils.register_class(one)
-
-
-def unregister() -> None:
-    """Take them off."""
-    for one in reversed(_CLASSES):
-        bpy.utils.unregister_class(one)
+#: Make them known, and take them off.
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

@@ -124,14 +124,5 @@ def _draw_text(layout: Any, text: str) -> None:
 
 _CLASSES = (HOOD_UL_garments, HOOD_PT_main)
 
-
-def register() -> None:
-    """Make them known."""
-    for one in _CLASSES:
-        bpy.utils.register_class(one)
-
-
-def unregister() -> None:
-    """Take them off."""
-    for one in reversed(_CLASSES):
-        bpy.utils.unregister_class(one)
+#: Make them known, and take them off.
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

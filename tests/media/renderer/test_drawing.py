@@ -64,7 +64,7 @@ def test_the_nearest_face_is_the_same_for_any_triangles(in_numpy):
             assert set(faces[one.face[pixel]]) & set(faces[other.face[pixel]])
         drawn = other.face >= 0
         assert (drawn == (one.face >= 0)).all()
-        assert np.allclose(one.nearness[drawn], other.nearness[drawn], rtol=0, atol=1e-5)  # float32 in C++
+        assert np.allclose(one.nearness[drawn], other.nearness[drawn], rtol=0, atol=4e-6)  # float32 in C++
 
 
 @needs_compiler

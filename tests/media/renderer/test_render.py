@@ -46,7 +46,7 @@ def test_rasterise_agrees_with_a_point_in_triangle_test() -> None:
     assert clear.sum() > 600
     assert (owner >= 0).sum() > 300
     drawn = (owner >= 0) & clear
-    np.testing.assert_allclose(seen.nearness.ravel()[drawn], best[drawn], rtol=1e-6)  # float32 in C++
+    np.testing.assert_allclose(seen.nearness.ravel()[drawn], best[drawn], rtol=5e-7)  # float32 in C++
 
 
 def test_shared_edges_leave_no_holes_and_chunks_do_not_matter() -> None:
