@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,9 +28,10 @@ from hood.assets.files.atomic import occupy, write_atomically
 from hood.assets.files.library import unknown
 from hood.assets.files.said import unheard
 from hood.evaluation.fitting import Minimum, Observed, Unknown, estimates, fit_steps, observed_frames, seen_ratios
+from hood.rollouts.equilibrium import relaxed_from
 from hood.rollouts.file.reader import RolloutData
 from hood.rollouts.file.recorder import still_of
-from hood.rollouts.loop import simulate
+from hood.rollouts.loop import own_start, simulate
 
 
 class _Kind(NamedTuple):
@@ -60,8 +62,8 @@ _SEVERAL = {"fabric": [*KINDS][:4], "wind": [*KINDS][-3:]}
 _USUAL = ("stepper=newton", "solver.target_rg=1e-7", "metrics=none", "guard=off", "video=none")
 #: Keys of a rollout that a fit has no use for.
 _IDLE = ("resume", "root", "formats", "output_fps", "refine_mesh", "sheet", "colour", "texture", "plan", "size_end")
-_LEAST_NOISE = 1e-5
-_SHEET = 5
+_LEAST_NOISE, _SHEET = 1e-5, 5
+_MEASURED_START = 4.0  # variances are at least so much larger where the cloth starts from a measured frame
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,8 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
         raise ConfigError(
             "observed: nothing was observed; give a rollout.h5 or a folder: hood fit observed=scans garment=dress"
         )
-    observed = observed_frames(str(config.observed) if frames is None else frames, bool(config.points), int(config.most_points))
+    seen, loss = str(config.observed) if frames is None else frames, (bool(config.whole), float(config.huber or math.inf))
+    observed = observed_frames(seen, bool(config.points), int(config.most_points), *loss)
     if "num_frames" in {word.partition("=")[0] for word in given}:
         last = (int(settings.num_frames) - int(config.first) - 1) // int(config.every)
         observed = replace(observed, frames=observed.frames[: max(last, 0) + 1])
@@ -132,7 +135,8 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
     check_config(settings)
     for sentence in idle_in_rollout(["stepper=newton", *given], settings):
         say(sentence)
-    scene = _Scene(settings, observed, int(config.first), int(config.every))
+    measured = bool(config.from_first) if config.from_first is not None else bool({*names} & {*_SEVERAL["fabric"]})
+    scene = _Scene(settings, observed, int(config.first), int(config.every), measured)
     scene.check({one.name: one.guess for one in unknowns})
     folder = prepare_folder(output_folder(config))
     with occupy(folder):
@@ -154,8 +158,12 @@ def _split(words: Sequence[str]) -> tuple[DictConfig, list[str]]:
     for key, least in (("first", 0), ("every", 1), ("most_points", 1), ("most_steps", 1)):
         if int(config[key]) < least:
             raise ConfigError(f"{key}={config[key]}: must be at least {least}")
-    if config.noise is not None and not (isinstance(config.noise, (int, float)) and config.noise > 0):
-        raise ConfigError(f"noise={shown(config.noise)}: give metres above 0, such as noise=0.002")
+    for key in ("noise", "huber"):
+        length = config[key]
+        if length is not None and not (isinstance(length, (int, float)) and length > 0):
+            raise ConfigError(f"{key}={shown(length)}: give metres above 0, such as {key}=0.02")
+    if config.whole and not config.points:
+        raise ConfigError("whole=true: is for points=true; vertices are compared one by one")
     windows = plain(config.windows)
     if not windows or not all(isinstance(share, (int, float)) and 0 < share <= 1 for share in windows) or windows[-1] != 1:
         raise ConfigError(f"windows={shown(windows)}: give shares of the frames, above 0, the last one 1, such as [0.25,1]")
@@ -185,7 +193,7 @@ def _unknowns(config: DictConfig, settings: RolloutSettings, names: Sequence[str
                               + (", both above 0" if kind.log else ""))  # fmt: skip
         guess = tables["guess"].get(name, _value(settings, name))
         if isinstance(guess, bool) or not isinstance(guess, (int, float)):
-            raise ConfigError(f"guess: {name} is {shown(guess)}; give a number, such as guess={{{name}:{_example(kind)}}}")
+            raise ConfigError(f"guess: {name} is {shown(guess)}; give a number from {lower:g} to {upper:g}")
         if not lower <= guess <= upper:
             raise ConfigError(f"guess: {name} is {guess:g}, outside its bounds {lower:g} to {upper:g}; give guess or bounds")
         prior = _pair("priors", name, tables["priors"][name]) if name in tables["priors"] else None
@@ -210,10 +218,6 @@ def _pair(key: str, name: str, value: Any) -> tuple[float, float]:
     if not numbers or not all(isinstance(one, (int, float)) and math.isfinite(one) for one in value):
         raise ConfigError(f"{key}: {name} is {shown(value)}; give two numbers, such as {key}={{{name}:[1,2]}}")
     return float(value[0]), float(value[1])
-
-
-def _example(kind: _Kind) -> str:
-    return f"{math.sqrt(kind.lower * kind.upper) if kind.log else 1.0:.2g}"
 
 
 def _value(settings: RolloutSettings, name: str) -> Any:
@@ -245,24 +249,36 @@ def _words(values: Mapping[str, float], settings: RolloutSettings) -> list[str]:
     return overrides(keys)
 
 
+def _across(points: np.ndarray) -> float:
+    """[m], twice the median distance from the middle: points of other things far away change little of it."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return float(2.0 * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
 class _Scene:
     """The simulation of values, and how far it lies from what was seen."""
 
-    def __init__(self, settings: RolloutSettings, observed: Observed, first: int, every: int) -> None:
+    def __init__(self, settings: RolloutSettings, observed: Observed, first: int, every: int, from_first: bool) -> None:
         self.settings, self.observed, self._first, self._every = settings, observed, first, every
-        self.ready: Setup | None = None
+        self.from_first = from_first and first == 0 and not observed.points and len(observed.frames) > 1
+        self.ready: Any = None  # Setup, once checked
 
     def check(self, values: Mapping[str, float]) -> None:
         """Raise ConfigError where the frames that were seen are not those of the scene."""
         with heard():
             self.ready = self._set_up(values)
-        scene = self.ready.scene
+        scene, settles = self.ready.scene, start_of(self.ready.config)[0] == "equilibrium"
+        settles = settles and own_start(self.ready.stepper, scene) is None
+        self.from_first = self.from_first and settles and bool(np.isfinite(self.observed.frames[0]).all())
         last = self._first + self._every * (len(self.observed.frames) - 1)
         if last >= scene.num_frames:
             raise ConfigError(
                 f"observed: its last frame is frame {last} of the simulation, but {scene.motion.name} has {scene.num_frames} "
                 "frames; give num_frames, first or every, or a longer motion"
             )
+        seen, worn = _across(self.observed.frames[0]), _across(scene.cloth.rest_pos.cpu().numpy())
+        if not 0.05 < seen / worn < 20.0 and len(self.observed.frames[0]) > 2:
+            raise ConfigError(f"observed: frame 0 is {seen / worn:.3g} times as large as the garment; give points in metres")
         if not self.observed.points:
             count = len(self.observed.frames[0])
             if count != scene.cloth.num_vertices:
@@ -284,8 +300,10 @@ class _Scene:
         """The number among the observed frames, cloth (V, 3) and body (W, 3) [m] of each of the first ``count``."""
         ready = self.ready = self._set_up(values)
         settle, relaxing = start_of(ready.config)
-        total = self._first + self._every * (count - 1) + 1
-        steps = simulate(ready.stepper, ready.scene, ready.potential, total, relaxing, metrics="none", settle=settle)
+        total, start, solved = self._first + self._every * (count - 1) + 1, None, (ready.scene, ready.potential)
+        if self.from_first:
+            start = relaxed_from(self.observed.frames[0], *solved, ready.stepper.gravity)
+        steps = simulate(ready.stepper, *solved, total, relaxing, metrics="none", settle=settle, start=start)
         for frame in steps:
             number, rest = divmod(frame.index - self._first, self._every)
             if number >= 0 and rest == 0:
@@ -299,7 +317,8 @@ class _Scene:
                 for number, cloth, _ in self.frames(values, count):
                     if not np.isfinite(cloth).all():
                         return np.full((1, 3), np.nan)
-                    assert self.ready is not None
+                    if number == 0 and self.from_first:
+                        continue
                     parts.append(self.observed.apart(number, cloth, self.ready.scene.garment.faces))
             except ConfigError:
                 raise
@@ -316,8 +335,7 @@ class _Fit:
         self._history: list[tuple[float, float]] = []  # share of the frames and rms
 
     def run(self) -> Fitted:
-        now, count, interrupted = None, 0, False
-        total = len(self._scene.observed.frames)
+        now, count, interrupted, total = None, 0, False, len(self._scene.observed.frames)
         counts = [max(min(2, total), math.ceil(share * total)) for share in plain(self._config.windows)]
         try:
             for count in dict.fromkeys(counts):
@@ -343,19 +361,18 @@ class _Fit:
 
     def _window(self, count: int) -> Iterator[Minimum]:
         """The search in the first ``count`` frames; the next one begins where it ends."""
-        noise = None if self._config.noise is None else float(self._config.noise)
-        free = 1 if self._scene.observed.points else 3
-        last = count == len(self._scene.observed.frames)
-
-        def residual(values: Mapping[str, float]) -> np.ndarray:
-            return self._scene.residual(values, count)
-
-        steps = fit_steps(residual, self._unknowns, noise, _LEAST_NOISE, int(self._config.most_steps), free, last)
+        noise, last = self._config.noise, count == len(self._scene.observed.frames)
+        residual = partial(self._scene.residual, count=count)
+        observed, most = self._scene.observed, int(self._config.most_steps)
+        groups = observed.groups(int(self._scene.from_first), count, self._scene.ready.scene.cloth.num_vertices)
+        steps = fit_steps(residual, self._unknowns, noise, _LEAST_NOISE, most, 1 if observed.points else 3, last, groups)
         for step, now in enumerate(steps):
             if now.covariance is None:
                 self._history.append((count / len(self._scene.observed.frames), now.rms))
                 values = ", ".join(f"{name} {value:.4g}" for name, value in now.values.items())
                 say(f"{count} frames, step {step}: {1e3 * now.rms:.3f} mm apart; {values}")
+            elif self._scene.from_first:
+                now = replace(now, covariance=_MEASURED_START * now.covariance)
             yield now
         self._unknowns = [replace(one, guess=now.values[one.name]) for one in self._unknowns]
 
@@ -402,8 +419,7 @@ class _Fit:
             write_course([1e3 * rms for _, rms in self._history], "mm from what was seen", "step", self._folder / "loss.png")
             with heard(aloud=False):
                 frames = [*self._scene.frames(now.values, len(self._scene.observed.frames))]
-            assert self._scene.ready is not None
-            fitted = _data(self._scene.ready, frames)
+                fitted = _data(self._scene.ready, frames)
             seen = self._scene.observed.drawn(fitted)
             panels = [Panel(seen, "observed"), Panel(fitted, f"fitted, {1e3 * now.rms:.2f} mm apart")]
             save_png(self._folder / "beside.png", SideBySide(panels, width=300, height=420).sheet(_SHEET))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from hood.assets.formats.vertex_files import read_points_folder
 from hood.mesh.closest_point.search import search_surface
@@ -22,21 +23,31 @@ from hood.rollouts.file.reader import RolloutData, read_rollout
 
 Misfit = Callable[[Mapping[str, float]], np.ndarray]
 
-#: Forward differences in the logarithm of an unknown, or in an unknown of a linear scale.
-_STEP = 0.01
+#: Forward differences in the logarithm of an unknown, or in an unknown of a linear scale, and the longest, along an axis of the
+#: Gauss-Newton matrix that the data tell little of: what jumps, as contact does, would hide the little.
+_STEP, _LONGEST_STEP = 0.01, 0.1
 #: Central differences at the minimum.
 _LONG_STEP = 0.03
 #: Farthest move of an unknown in one step.
 _FARTHEST = 1.2
 #: Damping at first, its factors after a step that was taken and one that was not, and where the search gives up.
-_DAMPING, _EASIER, _HARDER, _MOST_DAMPING = 1e-2, 0.2, 6.0, 1e6
-#: The minimum is reached where the Gauss-Newton step is shorter than this many standard deviations, promises no more than this
-#: share, or is smaller than the third number: a simulation is not smooth to any digit.
+_DAMPING, _EASIER, _HARDER, _MOST_DAMPING = 1e-2, 0.2, 6.0, 1e4
+#: The minimum is reached where the Gauss-Newton step is shorter than this many standard deviations, promises or brings no more
+#: than this share, or is smaller than the third number: a simulation is not smooth to any digit.
 _SHORT, _SHARE, _SMALL = 0.2, 1e-5, 5e-4
+#: The share in a search that only finds where another one begins.
+_ROUGH_SHARE = 1e-3
 #: Half the width of a 95% interval in standard deviations.
 _WIDTH = 1.96
 #: An unknown is seen where its interval is narrower than by this factor up and down.
 SEEN = 2.0
+#: The share of points that have their next one within the gap.
+_GAP = 0.98
+#: Patches of the cloth, and stretches of time: what is off in one goes together. An estimate from so few needs a wider
+#: interval, by Student's t of 7 and the factor for a mean that was taken off.
+_GROUPS, _FEW = 8, 2.365 / 1.96 * math.sqrt(8 / 7)
+#: Steps of differences that bounds have made more alike than this tell no Jacobian.
+_MOST_CONDITION = 1e4
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,7 @@ def fit_steps(
     most_steps: int,
     free: int = 1,
     intervals: bool = True,
+    groups: np.ndarray | None = None,
 ) -> Iterator[Minimum]:
     """Steps of the search: the guess, the place after every step, and at last the minimum with its covariance.
 
@@ -115,7 +127,8 @@ def fit_steps(
         least_noise: it is no smaller.
         most_steps: the search ends after so many; then the last one has not converged.
         free: directions of a row in which it may be off: fewer than D where the others are 0 by themselves.
-        intervals: False: the last one is left out, with its two evaluations an unknown.
+        intervals: False: the last one is left out, with its two evaluations an unknown, and the search is rougher.
+        groups: (K, N) numbers from 0: rows of the same one are off together, in any of K ways; None: each row by itself.
 
     Raises:
         ValueError: the residual at the guess is not finite, or no longer than there are unknowns.
@@ -129,7 +142,8 @@ def fit_steps(
         >>> last.converged, round(last.values["rate"], 3)
         (True, 3.0)
     """
-    return _Search(residual, list(unknowns), noise, least_noise, free).run(most_steps, intervals)
+    share = _SHARE if intervals else _ROUGH_SHARE
+    return _Search(residual, list(unknowns), (noise, least_noise), free, share, groups).run(most_steps, intervals)
 
 
 def estimates(minimum: Minimum, unknowns: Sequence[Unknown]) -> dict[str, Told]:
@@ -172,20 +186,53 @@ class Observed:
     Args:
         frames: (P, 3) m, each; vertices of the garment, rows of NaN where one was not seen, or with ``points`` any points.
         points: whether they belong to no vertices.
+        whole: whether points show all of the cloth, so that none lies where there are no points.
+        huber: [m] points farther away count by their distance instead of its square (Huber, 1964): they may be no cloth.
     """
 
     frames: Sequence[np.ndarray]
     points: bool
+    whole: bool = False
+    huber: float = math.inf
 
     def apart(self, number: int, cloth: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """(N, 3) m, from what was seen in a frame to the cloth (V, 3): to the vertex, or the nearest point of the surface."""
+        """(N, 3) m, from what was seen in a frame to the cloth (V, 3): to the vertex, or the nearest point of the surface; of
+        ``whole`` frames also from the nearest points to the vertices, as far as that is more than points are apart."""
         seen = self.frames[number]
         if not self.points:
             return (cloth - seen)[np.isfinite(seen).all(axis=1)]
         there, vertices, tri = torch.as_tensor(seen), torch.as_tensor(cloth), torch.as_tensor(faces)
         none = [torch.zeros(len(rows), dtype=torch.int64) for rows in (there, vertices, tri)]
         hit = search_surface(there, none[0], vertices, tri, none[1], none[2])
-        return ((vertices[tri[hit.face]] * hit.bary.unsqueeze(2)).sum(dim=1) - there).numpy()
+        rows = ((vertices[tri[hit.face]] * hit.bary.unsqueeze(2)).sum(dim=1) - there).numpy()
+        far = np.linalg.norm(rows, axis=1, keepdims=True)
+        if math.isfinite(self.huber):  # the square of a row is twice the loss of Huber
+            least = np.maximum(far, self.huber)
+            rows = rows * np.sqrt(self.huber * (2.0 * least - self.huber)) / least
+        return np.concatenate([rows, self._bare(seen, cloth)]) if self.whole else rows
+
+    def _bare(self, seen: np.ndarray, cloth: np.ndarray) -> np.ndarray:
+        """(V, 3) m, from the nearest of the points ``seen`` to the ``cloth``, less the largest gap of a point to its next: on
+        cloth that is seen evenly, points are no farther from anywhere."""
+        tree = cKDTree(seen)
+        gap = np.quantile(tree.query(seen, k=2)[0][:, 1], _GAP) if len(seen) > 1 else 0.0
+        far, nearest = tree.query(cloth)
+        bare: np.ndarray = (cloth - seen[nearest]) * np.maximum(1.0 - gap / np.maximum(far, 1e-12), 0.0)[:, None]
+        return bare
+
+    def groups(self, first: int, count: int, vertices: int) -> np.ndarray:
+        """(2, N): the patch of the cloth, of eight, and the stretch of time, of eight, that each row of the frames ``first`` to
+        ``count`` lies in; rows of the ``vertices`` of ``whole`` frames are in one more patch."""
+        begun, parts = self.frames[0], list[np.ndarray]()
+        known = begun[np.isfinite(begun).all(axis=1)]
+        centres = known[np.linspace(0, len(known) - 1, _GROUPS).astype(int)]
+        for number, frame in enumerate(self.frames[first:count]):
+            places = frame if self.points else np.where(np.isfinite(begun), begun, frame)
+            places = places[np.isfinite(frame).all(axis=1)]
+            patch = np.linalg.norm(places[:, None] - centres, axis=2).argmin(axis=1)
+            patch = np.append(patch, np.full(vertices if self.whole else 0, _GROUPS))
+            parts.append(np.stack([patch, np.full(len(patch), number * _GROUPS // (count - first))]))
+        return np.concatenate(parts, axis=1)
 
     def drawn(self, beside: RolloutData) -> RolloutData:
         """As a rollout in the place of another one; a point is drawn as a triangle of 8 mm."""
@@ -197,7 +244,7 @@ class Observed:
         return replace(beside, cloth_pos=pos, cloth_faces=np.arange(3 * count).reshape(-1, 3), rest_pos=pos[0], still={})
 
 
-def observed_frames(given: Any, points: bool, most: int) -> Observed:
+def observed_frames(given: Any, points: bool, most: int, whole: bool = False, huber: float = math.inf) -> Observed:
     """What was seen, from a file, a folder or arrays; of points at most so many of a frame, evenly picked.
 
     Raises:
@@ -226,14 +273,17 @@ def observed_frames(given: Any, points: bool, most: int) -> Observed:
                 f"observed: frame {number} has {len(frame)} vertices, frame 0 has {len(frames[0])}; give the same mesh "
                 "in every frame, or points=true where points belong to no vertices"
             )
-        if not np.isfinite(frames[number]).any():
+        if not np.isfinite(frames[number]).all(axis=1).any():
             raise ValueError(f"observed: frame {number} holds no point that is finite; leave out the frames from there on")
-    return Observed(frames, points)
+    return Observed(frames, points, points and whole, huber)
 
 
 class _Search:
-    def __init__(self, residual: Misfit, unknowns: list[Unknown], noise: float | None, least: float, free: int) -> None:
-        self._residual, self._unknowns, self._noise, self._least, self._free = residual, unknowns, noise, least, free
+    def __init__(
+        self, residual: Misfit, unknowns: list[Unknown], noise: tuple[float | None, float], free: int, share: float, groups: Any
+    ) -> None:
+        self._residual, self._unknowns, self._free, self._share, self._groups = residual, unknowns, free, share, groups
+        self._noise, self._least = noise
         self._rows = 0
         self._low = np.array([one.place(one.lower) for one in unknowns])
         self._high = np.array([one.place(one.upper) for one in unknowns])
@@ -256,21 +306,40 @@ class _Search:
     def _variance(self, r: np.ndarray) -> float:
         if self._noise is not None:
             return max(self._noise, self._least) ** 2
+        if self._free * self._rows < len(r):  # points: some are of other things, and rows of cloth among points are 0
+            far = np.linalg.norm(r.reshape(self._rows, -1), axis=1)
+            return float(max(1.4826 * np.median(far[far > 0]) if far.any() else 0.0, self._least) ** 2)
         return max(float(r @ r) / (self._rows * self._free - len(self._unknowns)), self._least**2)
 
     def _rms(self, r: np.ndarray) -> float:
         return math.sqrt(float(r @ r) / self._rows)
 
-    def _jacobian(self, z: np.ndarray, r: np.ndarray) -> np.ndarray:
-        """(N, P); a column that cannot be measured is 0, as that of an unknown that changes nothing."""
-        columns = []
-        for index in range(len(z)):
-            step = -_STEP if z[index] + _STEP > self._high[index] else _STEP
-            there = z.copy()
-            there[index] += step
-            after = self._at(there)
-            columns.append((after - r) / step if np.isfinite(after).all() else np.zeros_like(r))
-        return np.stack(columns, axis=1)
+    def _jacobian(self, z: np.ndarray, r: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+        """(N, P), along the axes of the Jacobian ``before``, where there was one; along what cannot be measured it is 0, as
+        for an unknown that changes nothing."""
+        ways = _STEP * np.eye(len(z)) if before is None else self._ways(before, _STEP)
+        moved = np.stack([self._within(z, way) for way in ways])
+        if np.linalg.cond(moved) > _MOST_CONDITION:  # at bounds
+            moved = np.stack([self._within(z, way) for way in _STEP * np.eye(len(z))])
+        ends = [self._at(z + way) for way in moved]
+        apart = np.stack([end - r if np.isfinite(end).all() else np.zeros_like(r) for end in ends], axis=1)
+        jacobian: np.ndarray = apart @ np.linalg.inv(moved.T)
+        return jacobian
+
+    @staticmethod
+    def _ways(jacobian: np.ndarray, step: float) -> np.ndarray:
+        """(P, P): in rows, steps along the axes of the Gauss-Newton matrix, of ``step`` along the best told, longer ones along
+        others. What the data do not tell is mostly a direction, as of unknowns that scale together: differences in each
+        unknown alone leave their truncation along it."""
+        told, axes = np.linalg.eigh(jacobian.T @ jacobian)
+        lengths = step * np.sqrt(max(told[-1], 1e-300) / np.maximum(told, 1e-12 * max(told[-1], 1e-300)))
+        found: np.ndarray = np.minimum(lengths, max(step, _LONGEST_STEP))[:, None] * axes.T
+        return found
+
+    def _within(self, z: np.ndarray, way: np.ndarray) -> np.ndarray:
+        """The step ``way`` from ``z`` or its opposite, whichever the bounds shorten less."""
+        both = [np.clip(z + sign * way, self._low, self._high) - z for sign in (1.0, -1.0)]
+        return max(both, key=lambda one: float(np.abs(one).sum()) + 1e-12 * float(one @ way > 0))
 
     def _cost(self, z: np.ndarray, r: np.ndarray, variance: float) -> float:
         cost = float(r @ r) / variance + float(self._weight @ (z - self._mean) ** 2)
@@ -282,26 +351,34 @@ class _Search:
         if not np.isfinite(r).all():
             raise ValueError("the simulation of the guess is not finite; give another guess")
         if self._rows * self._free <= len(z):
-            told = f"{self._rows * self._free} observed numbers cannot tell {len(z)} parameters"
-            raise ValueError(f"{told}; give more frames, or fit fewer")
+            few = f"{self._rows * self._free} observed numbers cannot tell {len(z)} parameters"
+            raise ValueError(f"{few}; give more frames, or fit fewer")
         history = [self._rms(r)]
         now = Minimum(self._values(z), history[0], self._evaluations, history=tuple(history))
         yield now
-        damping, done = _DAMPING, False
+        jacobian: np.ndarray | None = None
+        damping, done, told = _DAMPING, False, jacobian
         for _ in range(most_steps):
-            jacobian, variance = self._jacobian(z, r), self._variance(r)
-            step, r_next, damping, done = self._step(z, r, jacobian, variance, damping)
-            if step is None:
+            jacobian, variance, told = self._jacobian(z, r, jacobian), self._variance(r), None
+            step, there, damping, done = self._step(z, r, jacobian, variance, damping)
+            if intervals and (done or step is None):
+                z, r = (z, r) if step is None else (z + step, there)
+                told, step, there = self._along_axes(z, r, jacobian)
+                done, damping = step is None, _DAMPING
+            if step is not None:
+                z, r = z + step, there
+            elif told is None:
                 break
-            z, r = z + step, r_next
             history.append(self._rms(r))
             now = replace(now, values=self._values(z), rms=history[-1], evaluations=self._evaluations, history=tuple(history))
             yield now
-            if done:
+            if step is None or (done and not intervals):
                 break
         if not intervals:
             return
-        covariance = self._covariance(self._along_axes(z, jacobian), self._variance(r))
+        assert jacobian is not None
+        told = self._along_axes(z, r, jacobian)[0] if told is None else told
+        covariance = self._covariance(told, r)
         yield replace(now, evaluations=self._evaluations, converged=done, covariance=covariance)
 
     def _step(
@@ -317,14 +394,16 @@ class _Search:
             return None, r, damping, True
         best = self._damped(matrix, slope, free, 1e-9)
         promised = -float(slope @ best) - 0.5 * float(best @ matrix @ best)
-        done = promised < max(_SHORT**2, _SHARE * cost) or float(np.abs(best).max()) < _SMALL
+        little = max(_SHORT**2, self._share * cost)
+        done = promised < little or float(np.abs(best).max()) < _SMALL
         while damping < _MOST_DAMPING:
             step = self._damped(matrix, slope, free, damping)
             step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-300))
             step = np.clip(z + step, self._low, self._high) - z
             there = self._at(z + step)
-            if self._cost(z + step, there, variance) < cost:
-                return step, there, damping * _EASIER, done
+            gain = cost - self._cost(z + step, there, variance)
+            if gain > 0:
+                return step, there, damping * _EASIER, done or gain < little
             if done:
                 return None, r, damping, True
             damping *= _HARDER
@@ -338,25 +417,33 @@ class _Search:
         step[free] = -np.linalg.solve(part + damping * np.diag(np.diag(part) + 1.0), slope[free])
         return step
 
-    def _along_axes(self, z: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """The Jacobian (N, P) by central differences along the axes of the Gauss-Newton matrix. What the data do not tell is
-        mostly a direction, as of unknowns that scale together: along it nothing changes, while differences in each unknown
-        alone leave their truncation."""
-        axes = np.linalg.eigh(jacobian.T @ jacobian)[1]
-        columns = []
-        for axis in axes.T:
-            ends = [np.clip(z + sign * _LONG_STEP * axis, self._low, self._high) for sign in (1.0, -1.0)]
-            above, below = (self._at(end) for end in ends)
-            if not (np.isfinite(above).all() and np.isfinite(below).all()):
-                return jacobian
-            moved = ends[0] - ends[1]
-            # At a bound the ends are not on the axis: what they miss of it is left to the one-sided differences.
-            share = float(moved @ axis)
-            rest = axis * share - moved
-            columns.append((above - below + jacobian @ rest) / share if share > 0 else jacobian @ axis)
-        return np.stack(columns, axis=1) @ axes.T
+    def _along_axes(self, z: np.ndarray, r: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, Any, np.ndarray]:
+        """The Jacobian (N, P) by central differences along the axes of the Gauss-Newton matrix, and a step from there that is
+        better, with its residual; None where there is none."""
+        variance, better, there, moved, apart = self._variance(r), None, r, list[np.ndarray](), list[np.ndarray]()
+        least = self._cost(z, r, variance) - max(_SHORT**2, self._share * self._cost(z, r, variance))
+        for way in self._ways(jacobian, _LONG_STEP):
+            ends = [np.clip(z + sign * way, self._low, self._high) for sign in (1.0, -1.0)]
+            found = [self._at(end) for end in ends]
+            for end, after in zip(ends, found, strict=True):
+                if self._cost(end, after, variance) < least:
+                    least, better, there = self._cost(end, after, variance), end - z, after
+            moved.append(ends[0] - ends[1])
+            measured = np.isfinite(found[0]).all() and np.isfinite(found[1]).all()
+            apart.append(found[0] - found[1] if measured else jacobian @ moved[-1])
+        if np.linalg.cond(moved) > _MOST_CONDITION:  # at bounds
+            return jacobian, better, there
+        return np.stack(apart, axis=1) @ np.linalg.inv(np.transpose(moved)), better, there
 
-    def _covariance(self, jacobian: np.ndarray, variance: float) -> np.ndarray:
-        matrix = jacobian.T @ jacobian / variance + np.diag(self._weight)
+    def _covariance(self, jacobian: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """(P, P). Wider than by the noise where residuals go together in ``groups``, as those of a model that is not quite that
+        of the cloth do (sandwich estimate: White, 1980; of several groupings: Cameron, Gelbach and Miller, 2011)."""
+        matrix = jacobian.T @ jacobian / self._variance(r) + np.diag(self._weight)
         covariance: np.ndarray = np.linalg.inv(matrix + 1e-6 * np.eye(len(matrix)))
-        return covariance
+        if self._groups is None:
+            return covariance
+        pulls = (r[:, None] * jacobian).reshape(self._rows, -1, len(matrix)).sum(axis=1) @ covariance / self._variance(r)
+        sums = [np.stack([np.bincount(rows, pull) for pull in pulls.T]) for rows in self._groups]
+        found = np.sum([((_FEW * each) ** 2).sum(axis=1) for each in sums], axis=0)
+        wider = np.sqrt(np.maximum(found / np.diag(covariance), 1.0))
+        return covariance * np.outer(wider, wider)

@@ -12,7 +12,9 @@ import trimesh
 
 import hood
 from hood.app import fit as fitting
+from hood.app.settings.rollout_settings import RolloutSettings, overrides
 from hood.cli.main import main
+from hood.evaluation.fitting import Observed
 from hood.mesh.shapes import grid
 
 FRAMES = 8
@@ -130,6 +132,43 @@ def test_a_search_that_is_cut_short_ends_with_3_and_an_interrupted_one_keeps_the
     assert 4e3 < kept["parameters"]["lame_mu"]["value"] < 2e4
 
 
+def test_worn_cloth_starts_from_the_first_frame_that_was_seen() -> None:
+    keys: dict[str, Any] = {"garment": "tank", "sequence": "plie", "num_frames": 3}
+    steps = hood.simulate(**keys, stepper="newton", metrics="none")
+    frames = np.stack([frame.world_pos.numpy() for frame in steps])
+    noisy = frames + 2e-3 * np.random.default_rng(0).normal(size=frames.shape)
+    settings = RolloutSettings.from_words(["stepper=newton", "metrics=none", "video=none", *overrides(keys)])
+    scene = fitting._Scene(settings, Observed([*noisy], False), 0, 1, True)
+    scene.check({})
+    begun = next(cloth for _, cloth, _ in scene.frames({}, 2))
+    off, noise = (np.linalg.norm(one - frames[0], axis=1) for one in (begun, noisy[0]))
+    assert np.sqrt((off**2).mean()) < 0.5 * np.sqrt((noise**2).mean())
+    assert len(scene.residual({}, 3)) == 2 * frames.shape[1]
+    noisy[0, 5] = np.nan
+    scene = fitting._Scene(settings, Observed([*noisy], False), 0, 1, True)
+    scene.check({})
+    assert not scene.from_first
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(["parameters=[size]"], False), (["parameters=[size,lame_mu]"], True), (["parameters=[size]", "from_first=true"], True)],
+)
+def test_a_fabric_is_fitted_from_the_first_frame_and_a_size_is_not(
+    words: list[str], expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Asked(Exception):
+        pass
+
+    def scene(*arguments: Any) -> None:
+        raise Asked(arguments[-1])
+
+    monkeypatch.setattr(fitting, "_Scene", scene)
+    with pytest.raises(Asked) as asked:
+        fitting.run_fit(["garment=tank", *words], np.zeros((3, 5, 3)))
+    assert asked.value.args == (expected,)
+
+
 @pytest.mark.parametrize(
     ("word", "message"),
     [
@@ -141,6 +180,8 @@ def test_a_search_that_is_cut_short_ends_with_3_and_an_interrupted_one_keeps_the
         ("priors={lame_mu:3}", "priors: lame_mu is 3; give two numbers"),
         ("windows=[0.5]", "windows=[0.5]: give shares of the frames, above 0, the last one 1"),
         ("noise=-1", "noise=-1: give metres above 0"),
+        ("huber=0", "huber=0: give metres above 0"),
+        ("whole=true", "whole=true: is for points=true"),
         ("every=0", "every=0: must be at least 1"),
         ("refine_mesh=1", "refine_mesh=1: hood fit has no use for it"),
         ("garmnt=tank", "did you mean 'garment'"),
@@ -169,6 +210,8 @@ def test_frames_that_do_not_fit_are_refused(sheet: Path, seen: np.ndarray, tmp_p
         hood.fit([seen[0][1:], seen[1]], **keys)
     with pytest.raises(ValueError, match="frame 2 holds no point that is finite"):
         hood.fit(np.where(np.arange(FRAMES)[:, None, None] == 2, np.nan, seen), **keys)
+    with pytest.raises(ValueError, match="frame 0 is 1e\\+03 times as large as the garment; give points in metres"):
+        hood.fit(1e3 * seen, **keys)
     folder = as_folder(tmp_path / "seen", seen)
     (folder / "frame_003.ply").unlink()
     with pytest.raises(ValueError, match=r"there is no frame 3 between frame_000\.ply and frame_007\.ply"):

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from hood.evaluation.fitting import Minimum, Misfit, Unknown, estimates, fit_steps, seen_ratios
+from hood.evaluation.fitting import Minimum, Misfit, Observed, Unknown, estimates, fit_steps, observed_frames, seen_ratios
+from hood.mesh.shapes import grid
 
 TIMES = np.linspace(0.0, 2.0, 40)
 
@@ -108,3 +109,67 @@ def test_places_that_cannot_be_simulated_are_left_alone() -> None:
 def test_a_search_that_is_cut_short_has_not_converged() -> None:
     seen = decay({"height": 1.0, "rate": 1.0})
     assert not solved(lambda of: decay(of) - seen, two(5.0), most=1).converged
+
+
+def test_intervals_hold_the_truth_where_residuals_go_together() -> None:
+    """Model error that neighbours and following frames share tells as often as there are patches, not rows."""
+    held, patch = {True: 0, False: 0}, np.repeat(np.arange(8), 50)
+    table = np.random.default_rng(1).normal(size=(8, 2))[patch] + 0.1
+    unknowns = [Unknown(name, 0.0, -9.0, 9.0, log=False) for name in ("a", "b")]
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        off = 0.1 * rng.normal(size=8)[patch] + 0.02 * rng.normal(size=400)
+        for known in held:
+            groups = np.stack([patch, np.arange(400) % 8]) if known else None
+
+            def residual(of: Mapping[str, float], off: np.ndarray = off) -> np.ndarray:
+                return np.asarray(table @ [of["a"], of["b"]] - off)
+
+            *_, last = fit_steps(residual, unknowns, None, 1e-9, 20, groups=groups)
+            one = estimates(last, unknowns)["a"]
+            held[known] += one.low <= 0.0 <= one.high
+    assert held[True] >= 54
+    assert held[False] < 30
+
+
+def test_a_search_looks_along_its_axes_before_it_ends() -> None:
+    """Jumps of the residual hide a valley from short differences in each unknown; along its axis longer ones show it."""
+
+    def residual(of: Mapping[str, float]) -> np.ndarray:
+        along, across = math.log(of["a"] * of["b"]), math.log(of["a"] / of["b"])
+        jumps = 2e-3 * np.sin(np.arange(1.0, 31.0) * round(300.0 * along))
+        return np.concatenate([0.05 * along * np.ones(10), across * np.ones(10), jumps])
+
+    found = solved(residual, [Unknown("a", 9.0, 0.01, 100.0), Unknown("b", 2.0, 0.01, 100.0)])
+    assert found.converged
+    assert found.values["a"] * found.values["b"] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_cloth_larger_than_a_cloud_is_seen_where_the_cloud_is_whole(whole: bool) -> None:
+    pos, faces = grid(21, 21, 1.0)
+    rng = np.random.default_rng(0)
+    cloud = (rng.dirichlet((1, 1, 1), 800)[:, :, None] * pos[faces[rng.integers(len(faces), size=800)]]).sum(axis=1)
+    seen = observed_frames([cloud], True, 800, whole)
+    found = solved(lambda of: seen.apart(0, of["size"] * pos, faces), [Unknown("size", 1.4, 0.5, 2.0)], noise=1e-3)
+    assert found.values["size"] == pytest.approx(1.0 if whole else 1.4, abs=0.06)
+    groups = seen.groups(0, 1, len(pos))
+    assert groups.shape == (2, 800 + whole * len(pos))
+
+
+def test_points_of_other_things_pull_by_their_distance() -> None:
+    pos, faces = grid(11, 11, 1.0)
+    rng = np.random.default_rng(0)
+    cloud = (rng.dirichlet((1, 1, 1), 400)[:, :, None] * pos[faces[rng.integers(len(faces), size=400)]]).sum(axis=1)
+    flat = int(np.ptp(pos, axis=0).argmin())
+    cloud[:20, flat] += 1.0
+    found = {}
+    for huber in (math.inf, 0.02):
+        seen, up = Observed([cloud], True, huber=huber), np.eye(3)[flat]
+        unknowns = [Unknown("height", 0.3, -1.0, 1.0, log=False)]
+        found[huber] = solved(
+            lambda of, seen=seen, up=up: seen.apart(0, pos + of["height"] * up, faces),  # type: ignore[misc]
+            unknowns,
+        ).values["height"]
+    assert found[math.inf] == pytest.approx(0.05, abs=5e-3)
+    assert found[0.02] == pytest.approx(0.02 * 20 / 380, abs=5e-4)
