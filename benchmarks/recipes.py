@@ -8,6 +8,7 @@
     python benchmarks/recipes.py shipped                    # both again, told what the potential asks of single vertices
     python benchmarks/recipes.py heads                      # one pass that predicts positions, or edges to solve positions from
     python benchmarks/recipes.py forces                     # forces, and steps of all vertices together under them
+    python benchmarks/recipes.py unroll                     # losses that look at one, two and three steps, in equal time
     python benchmarks/recipes.py paper_head                 # the paper's own network, one choice of paper_fast taken back
 
 Every run is ``hood train`` in a process of its own with one thread, ``--jobs`` of them side by side; its time is the CPU time
@@ -150,6 +151,11 @@ SUITES: dict[str, list[Recipe]] = {
         fast("forces", 2 * SHORT, *FORCES),
         fast("forces, shorter", SHORT, *FORCES),
         fast("forces, 4 passes, shorter", SHORT, *FORCES, f"model.schedule='{FOUR_PASSES}'"),
+    ],
+    "unroll": [
+        fast("one step", 233, *EDGES, "trainer.schedule.warmup=20", "trainer.ema_decay=0.98"),
+        fast("two steps", 100, *EDGES, "trainer.unroll=2", "trainer.schedule.warmup=9", "trainer.ema_decay=0.954"),
+        fast("three steps", 61, *EDGES, "trainer.unroll=3", "trainer.schedule.warmup=5", "trainer.ema_decay=0.926"),
     ],
     "paper_head": [
         head("paper_fast"),

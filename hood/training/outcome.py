@@ -20,9 +20,10 @@ from torch import Tensor
 from hood.assets.files.said import say
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import centres_of
-from hood.energies.potential import scale
+from hood.energies.potential import relative_gradient, scale
 from hood.energies.problem import StepProblem
 from hood.scene.scene import RELAXING_DT
+from hood.steppers.network import Prediction
 from hood.training.slots import Taken, is_lost
 
 #: What is measured of an update beside the energies: the mean loss of its scenes, the median of their rg, and the spread of the
@@ -53,6 +54,23 @@ class Signal:
     def _damping(self, residual: Tensor) -> Tensor:
         """How much of a scene (B,) counts: with a scaled signal one that is far from rest less, as far as it is."""
         return torch.ones_like(residual) if self._name == "potential" else 1.0 / (1.0 + residual / 3.0)
+
+
+def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
+    """A number () whose gradient is that of the training signal: the energies' own is put in at the output, so that no graph
+    through them is kept.
+
+    Args:
+        gradient: (V, 3) N, of the energies at the prediction; zero at vertices that are not free.
+        residual: (B,), the relative gradient.
+    """
+    scene = problem.cloth.vertex_scene
+    weight = signal.weight(problem, residual)
+    surrogate = (prediction.next_pos * (gradient * weight[scene].unsqueeze(1))).sum()
+    for pos, force in prediction.early:  # every pass answers for where it leads itself
+        weight = signal.weight(problem, relative_gradient(problem, force))
+        surrogate = surrogate - (pos * (force * weight[scene].unsqueeze(1))).sum()
+    return surrogate
 
 
 #: Columns of :attr:`Update.told` where the device decides.

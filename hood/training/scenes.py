@@ -37,10 +37,10 @@ _MOST_NOISE = 0.1
 class Window:
     """One training scene and the frame at which its rollout starts."""
 
-    scene: Scene
-    start_frame: int
+    scene: Scene  # cloth and body
+    start_frame: int  # of the scene's motion
     template: int = 0  # index into the sampler's garments
-    mirrored: bool = False
+    mirrored: bool = False  # the scene is shown as its image x → −x
     still: bool = False  # a rollout of one step holds the body still for a regular dt, and is no relaxing step
 
     def to(self, device: torch.device | str) -> Window:
@@ -57,13 +57,12 @@ class Drawn:
     """What a training scene is made of."""
 
     template: int  # index into the sampler's garments
-    sequence: (
-        PoseSequence  # with a frame before the start frame, where there is one, and all frames that are asked for behind it
-    )
+    #: With a frame before the start frame, where there is one, and all frames that are asked for behind it.
+    sequence: PoseSequence
     start_frame: int  # in ``sequence``
     betas: np.ndarray  # shape coefficients of the body
     size: float  # factor of the garment
-    material: Material
+    material: Material  # the fabric
     mirrored: bool = False  # the scene is shown as its image x → −x
     still: bool = False  # see :class:`Window`
 

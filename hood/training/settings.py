@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, cast
 
 import torch
+from torch import nn
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
-from hood.model.features.normalizer import Whitening
+from hood.energies.potential import Potential
+from hood.energies.self_contact import for_networks
+from hood.model.features.normalizer import RunningNormalizer, Whitening
 from hood.model.kernels.block import KERNELS
 from hood.model.network.kernel_choice import AUTO
 from hood.model.network.mlp import MLP
@@ -44,6 +48,19 @@ def make_whitening(simulator: NetworkStepper, on: bool) -> Whitening:
     return Whitening(layers, encoders, columns, fresh)
 
 
+@contextmanager
+def uncounted(module: nn.Module) -> Iterator[None]:
+    """Normalisers in ``module`` count nothing in here, in training mode as well."""
+    counting = [part for part in module.modules() if isinstance(part, RunningNormalizer) and part.training]
+    for part in counting:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in counting:
+            part.training = True
+
+
 #: How an update is computed: operation by operation, with fixed shapes, or as a CUDA graph of them; by itself the last.
 _STEPS = ("auto", "plain", "fixed", "captured")
 
@@ -74,6 +91,8 @@ class TrainerSettings:
     ``time_scale``: factor on the whole schedule, see :meth:`compressed`. ``max_vertices``: batches of garments of similar size,
     :mod:`hood.training.slots`. ``workers``: processes that make scenes ahead, None for one per idle core.
     ``step``: how an update is computed, :class:`hood.training.updates.CapturedUpdates`.
+    ``unroll``: steps that the loss of an update looks at, see :func:`hood.training.updates.further_loss`; rollouts go on by
+    one.
     ``activation_checkpointing``: keep the latents between processor steps only and compute the rest again when it is needed.
     """
 
@@ -105,6 +124,7 @@ class TrainerSettings:
     workers: int | None = 0
     activation_checkpointing: bool = False
     step: str = "auto"
+    unroll: int = 1
 
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
@@ -126,7 +146,12 @@ class TrainerSettings:
             raise ValueError(
                 f"trainer.torn_strain={self.torn_strain:g}: with trainer.by_rollout=true torn rollouts go on; drop one"
             )
-        for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped"):
+        if self.unroll > 1 and self.step not in ("auto", "plain"):
+            raise ValueError(
+                f"trainer.step={self.step} with trainer.unroll={self.unroll}: further steps are taken operation by operation; "
+                "give trainer.step=plain or trainer.unroll=1"
+            )
+        for name in ("iterations", "batch_size", "checkpoint_every", "log_every", "max_skipped", "unroll"):
             if getattr(self, name) < 1:
                 raise ValueError(f"trainer.{name} is {getattr(self, name)}; it must be at least 1")
         for name in ("validate_every", "max_rollbacks", "statistics_iterations"):
@@ -157,6 +182,22 @@ class TrainerSettings:
                 f"trainer.iterations={self.iterations}: the first {self.statistics_iterations} only collect "
                 "statistics, so nothing would be trained; give more, or fewer trainer.statistics_iterations=…"
             )
+
+    def require_unroll(self, simulator: NetworkStepper, potential: Potential, ranks: int) -> None:
+        """Raise ValueError where gradients cannot go through the state from step to step."""
+        reasons = {
+            "several processes that share a batch take one step alone": ranks > 1,
+            "the passes of a further step have no loss of their own": len(simulator.network.passes) > 1,
+            "the model counts in frames": simulator.rules.frame_dt is not None,
+            "layers of cloth are not followed": simulator.layer_radius is not None
+            or len(for_networks(potential).terms) < len(potential.terms),
+            "contact at edges or faces is not followed": any(
+                getattr(term, "contact", "vertices") != "vertices" for term in potential.terms.values()
+            ),
+        }
+        refused = next((reason for reason, holds in reasons.items() if holds), None)
+        if self.unroll > 1 and refused is not None:
+            raise ValueError(f"trainer.unroll={self.unroll}: {refused}; use trainer.unroll=1")
 
     def is_due(self, iteration: int) -> bool:
         """Whether something follows an iteration for which it must be known what came of the updates so far."""

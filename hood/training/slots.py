@@ -96,6 +96,32 @@ class TrainingStep(NamedTuple):
     step: StepInput
     kind: tuple[int, bool] | None = None  # template, and whether mirrored: what the topology of a scene alone depends on
     runs: Tensor | None = None  # () bool: whether the rollout of a scene alone still goes on; None: it does
+    ahead: Ahead | None = None  # what follows, of a batch
+
+
+class Ahead:
+    """The steps that follow one of a batch, without the rollouts going on."""
+
+    def __init__(self, slots: Slots) -> None:
+        self._slots, self._running = slots, slots.running
+        self._counts = [slot.window.scene.cloth.num_vertices for slot in self._running if slot.window is not None]
+
+    def velocity(self, next_vel: Tensor) -> Tensor:
+        """(V, 3) m/s that the next step begins with, of what the simulator says of this one."""
+        return torch.cat(self._slots.velocities(next_vel))
+
+    def step(self, number: int, pos: Tensor) -> tuple[StepInput, Tensor]:
+        """What is prescribed for step ``number`` after this one, from positions (V, 3) [m], and which scenes (B,) bool have so
+        many in their motion; of the others the last."""
+        steps, there, last = [], [], self._slots.max_horizon
+        for slot, own in zip(self._running, pos.detach().split(self._counts), strict=True):
+            assert slot.window is not None
+            assert slot.state is not None
+            age = slot.age + number
+            there.append(age <= last)
+            frame = slot.window.start_frame + max(min(age, last) - 1, 0)
+            steps.append(slot.window.scene.step_input(frame, replace(slot.state, pos=own)))
+        return concatenate_step_inputs(steps, self._counts), torch.tensor(there, device=pos.device)
 
 
 @dataclass
@@ -190,7 +216,23 @@ class Slots:
             cloth = concatenate_cloths([part.cloth for part in parts])
             self._batches[number] = (cloth, self.simulator.concatenate(cloth, [part.prepared for part in parts], counts))
         states, steps = [part.state for part in parts], [part.step for part in parts]
-        return TrainingStep(*self._batches[number], concatenate_states(states), concatenate_step_inputs(steps, counts))
+        given = concatenate_states(states), concatenate_step_inputs(steps, counts)
+        return TrainingStep(*self._batches[number], *given, ahead=Ahead(self))
+
+    @property
+    def running(self) -> list[_Slot]:
+        """Those of the update whose turn it is."""
+        return list(self._current()[1].values())
+
+    def velocities(self, next_vel: Tensor) -> list[Tensor]:
+        """Velocities (V, 3) [m/s] of every rollout after a step of which the simulator says ``next_vel``, of all one after the
+        other."""
+        found, offset = [], 0
+        for slot in self.running:
+            assert slot.window is not None
+            own = next_vel[offset : (offset := offset + slot.window.scene.cloth.num_vertices)]
+            found.append(self._relaxed(slot, own) if slot.age == 0 else own)
+        return found
 
     def each(self, horizon: int) -> list[TrainingStep]:
         """The current problems as in :meth:`batch`, every scene alone."""
@@ -256,14 +298,12 @@ class Slots:
 
     def _take_over(self, next_pos: Tensor, next_vel: Tensor) -> list[Taken]:
         number, slots = self._current()
-        offset, taken = 0, []
-        for slot in slots.values():
+        taken, velocities = [], self.velocities(next_vel.detach())
+        places = next_pos.detach().split([len(vel) for vel in velocities])
+        for slot, pos, vel in zip(slots.values(), places, velocities, strict=True):
             assert slot.window is not None
             assert slot.state is not None
-            rows = slice(offset, offset + slot.window.scene.cloth.num_vertices)
-            offset = rows.stop
-            vel = self._relaxed(slot, next_vel[rows].detach()) if slot.age == 0 else next_vel[rows].detach()
-            slot.state = State(next_pos[rows].detach(), vel, slot.state.origin)
+            slot.state = State(pos, vel, slot.state.origin)
             slot.age += 1
             taken.append(Taken(slot, slot.window, slot.state))
         self._turns[number] += 1

@@ -52,11 +52,10 @@ _Progress = Callable[[int, dict[str, float] | None], None]
 class Trainer:
     """Owns the optimisation: slots of running rollouts, optimiser, averaged weights, checkpoints.
 
-    Files in ``folder``: ``checkpoint.pt`` and ``checkpoint.previous.pt`` (resume), ``model.safetensors`` (use),
-    ``best.safetensors`` (use; the best validation so far), ``kept/`` (checkpoint and weights of the iterations ``keep_at``),
-    ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0 alone writes and reads them. A disk that refuses a file
-    ends the training with the last checkpoint intact. ``earlier``: iterations behind weights that were given; model files count
-    them with their own.
+    ``simulator``, ``potential``, ``settings`` (the keys of ``trainer``), ``folder``, ``seed`` and ``iteration`` are attributes.
+    Files: ``checkpoint.pt``, ``checkpoint.previous.pt`` (resume), ``model.safetensors``, ``best.safetensors`` (best validation
+    so far), ``kept/`` (of the iterations ``keep_at``), ``metrics.jsonl``, ``validation/``, TensorBoard events. Process 0 alone
+    writes them. A disk that refuses a file ends the training, the last checkpoint intact. ``earlier``: updates of given ones.
     """
 
     def __init__(
@@ -88,6 +87,7 @@ class Trainer:
         simulator.network.use_kernels(settings.kernels if self.choice is None else self.choice.kernels)
         simulator.network.use_checkpointing(settings.activation_checkpointing)
         ranks, rank = distributed.world_size(), distributed.rank()
+        settings.require_unroll(simulator, potential, ranks)
         if settings.batch_size % ranks:
             raise ValueError(f"trainer.batch_size={settings.batch_size} cannot be shared by {ranks} processes; use a multiple")
         longest = settings.horizon.maximum - settings.horizon.with_relaxing
@@ -110,9 +110,8 @@ class Trainer:
         self.iteration, self.earlier, self.rollbacks, self.best = 0, earlier, 0, math.inf
         self.stopwatch: Stopwatch | None = None  # told where an update's time goes
         self.observe: Observer | None = None
-        self._skips = Skipped()
+        self._skips, self.stopped = Skipped(), ""  # why a callback ended the training
         self._rollbacks_in_row, self._failed_at, self._saved_at = 0, -1, -1
-        self.stopped = ""  # why a callback ended the training
         self.reporter = Reporter(self, loggers, callbacks)
         self._steps = WeightSteps(simulator, self.optimizer, self.whitening, settings.ema_decay)
         self._begun: list[StartedUpdate] = []  # updates that :meth:`look` has not told of
@@ -120,6 +119,7 @@ class Trainer:
 
     @property
     def checkpoint_path(self) -> Path:
+        """The file that a training is resumed from."""
         return self.folder / "checkpoint.pt"
 
     @property
@@ -271,8 +271,9 @@ class Trainer:
             part = self.slots.batch(horizon)
         if collecting and simulator.output.collects_statistics and self.whitening.fresh:  # else they came with the weights
             simulator.output.observe(self.slots.skinned_accelerations())
-        model = simulator if collecting else self.model
-        return plain_update(simulator, model, part, potential, self.signal, self.slots.ending_strain, clock, self.observe)
+        model, unroll = (simulator, 1) if collecting else (self.model, self.settings.unroll)
+        ending = self.signal, self.slots.ending_strain
+        return plain_update(simulator, model, part, potential, *ending, clock, self.observe, unroll)
 
     def averaged(self) -> NetworkStepper:
         """The simulator with exponentially averaged weights (the plain ones when averaging is off), in eval mode."""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from hood.cloth.cloth import Cloth
+from hood.cloth.state import State
 from hood.energies.potential import Potential, relative_gradient
 from hood.energies.problem import StepProblem
 from hood.energies.self_contact import for_networks
@@ -19,38 +20,23 @@ from hood.model.features.inputs import Inputs
 from hood.model.features.normalizer import RunningNormalizer
 from hood.model.graph.static_shapes import Capacity, StaticLayout, lay_out
 from hood.native import features as native
+from hood.rollouts.adjoint import following, step_gap
+from hood.solver.newton import NewtonSettings
 from hood.solver.vertex.block_jacobi import incidence_of
 from hood.steppers.network import NetworkStepper, Prediction, Prepared
 from hood.steppers.protocol import Stopwatch, timed
 from hood.steppers.static_shapes.cuda_graph import CudaGraph, InputMemory, Run, has_graphs, trace
 from hood.steppers.static_shapes.problem import altered, problem_from, settled_potential, step_inputs, step_shape
 from hood.steppers.static_shapes.simulator import first_capacity, more_capacity, see
-from hood.tensors.dense import products
+from hood.tensors.dense import inputs_followed, products
 from hood.training.curriculum import CollisionRamp, contact_weight, with_weight_on_device
 from hood.training.optimiser import can_be_taken_back
-from hood.training.outcome import TOLD, Acceptance, Figures, Signal, Update, figures_of, outcome_of
-from hood.training.settings import TrainerSettings
-from hood.training.slots import TrainingStep
+from hood.training.outcome import TOLD, Acceptance, Figures, Signal, Update, figures_of, outcome_of, surrogate_of
+from hood.training.settings import TrainerSettings, uncounted
+from hood.training.slots import TrainingStep, is_lost
 
 #: Told of an update: what had to be solved, by which potential, the prediction, and its residual (B,).
 Observer = Callable[[StepProblem, Potential, Prediction, Tensor], None]
-
-
-def surrogate_of(problem: StepProblem, prediction: Prediction, gradient: Tensor, residual: Tensor, signal: Signal) -> Tensor:
-    """A number () whose gradient is that of the training signal: the energies' own is put in at the output, so that no graph
-    through them is kept.
-
-    Args:
-        gradient: (V, 3) N, of the energies at the prediction; zero at vertices that are not free.
-        residual: (B,), the relative gradient.
-    """
-    scene = problem.cloth.vertex_scene
-    weight = signal.weight(problem, residual)
-    surrogate = (prediction.next_pos * (gradient * weight[scene].unsqueeze(1))).sum()
-    for pos, force in prediction.early:  # every pass answers for where it leads itself
-        weight = signal.weight(problem, relative_gradient(problem, force))
-        surrogate = surrogate - (pos * (force * weight[scene].unsqueeze(1))).sum()
-    return surrogate
 
 
 def plain_update(
@@ -62,11 +48,13 @@ def plain_update(
     torn_strain: float,
     clock: Stopwatch | None = None,
     observe: Observer | None = None,
+    unroll: int = 1,
 ) -> Update:
     """One step of all scenes of ``part``, operation by operation.
 
     Args:
         model: the simulator, or what processes that share a batch have around it.
+        unroll: steps that the loss looks at, this one included.
         torn_strain: see :func:`hood.training.slots.is_lost`.
     """
     cloth, state = part.cloth, part.state
@@ -83,9 +71,14 @@ def plain_update(
         residual = relative_gradient(problem, gradient)
     if observe is not None:
         observe(problem, potential, prediction, residual)
+    further = None
+    if unroll > 1:
+        further = further_loss(simulator, part, potential, signal, torn_strain, (problem, prediction), unroll - 1, clock)
 
     def backward() -> None:
         surrogate = surrogate_of(problem, prediction, gradient, residual, signal)
+        if further is not None:
+            surrogate = surrogate + further
         if model is not simulator:
             # A share without body edges leaves their networks out; all processes must reduce the same parameters.
             surrogate = surrogate + 0.0 * sum(p.sum() for p in simulator.parameters())
@@ -99,6 +92,53 @@ def plain_update(
         outcome_of(cloth, next_pos, torn_strain),
         backward,
     )
+
+
+#: How near the minimum is come to that a further step is measured from.
+_NEAR = NewtonSettings(target_rg=1e-2, max_iterations=50)
+
+
+def further_loss(
+    simulator: NetworkStepper,
+    part: TrainingStep,
+    potential: Potential,
+    signal: Signal,
+    torn_strain: float,
+    first: tuple[StepProblem, Prediction],
+    num_steps: int,
+    clock: Stopwatch | None = None,
+) -> Tensor:
+    """The loss () of the steps that follow the ``first`` one, each from the state that the network itself came to.
+
+    Positions and velocities carry gradients from step to step. A minimum of the potential depends on the state that a step
+    begins with: to lower it would be to come to other states, not to better steps. So a further step has its gap as loss, see
+    :func:`hood.rollouts.adjoint.step_gap`, weighed by the signal; that of an exact network is zero, and so is its
+    gradient. Rollouts go on by the first step alone, and statistics count that alone. Scenes that are lost, or whose motion
+    ends, have no further loss.
+    """
+    cloth, assumed = part.cloth, part.ahead
+    assert assumed is not None
+    problem, prediction = first
+    pos, vel = prediction.next_pos, assumed.velocity(simulator.next_velocity(problem, prediction))
+    total, goes_on = pos.new_zeros(()), torch.ones(part.cloth.num_scenes, dtype=torch.bool, device=pos.device)
+    with uncounted(simulator):
+        for number in range(1, num_steps + 1):
+            step, there = assumed.step(number, pos)
+            goes_on = goes_on & there & ~is_lost(cloth, pos.detach(), torn_strain)
+            if not bool(goes_on.any()) or not bool(pos.isfinite().all()):
+                break
+            state = State(pos, vel, part.state.origin)
+            with timed(clock, "search"):
+                taken, followed = following(potential, StepProblem(cloth, state, step, gravity=simulator.gravity))
+            with inputs_followed():
+                prediction = simulator.predict(followed, part.prepared, clock)
+            pos, vel = prediction.next_pos, simulator.next_velocity(followed, prediction)
+            with timed(clock, "losses"):
+                gradient, _ = potential.gradient(taken, pos.detach())
+                weight = signal.weight(taken, relative_gradient(taken, gradient * cloth.free.unsqueeze(1)))
+                above = step_gap(potential, taken, followed, pos, _NEAR)
+                total = total + torch.where(goes_on & above.isfinite(), weight * above, 0.0).sum()
+    return total
 
 
 #: Scenes of an update that graphs take one after the other, unless asked for. To start the 6,000 kernels of a plain update
@@ -348,6 +388,8 @@ def make_captured(
     mode, refused = settings.step, refusal(simulator, settings.collision)
     if not can_be_taken_back(settings.optimizer):
         refused = "steps of trainer.optimizer must be undone on the device, which adam, muon, torch.optim.Adam and AdamW can"
+    if settings.unroll > 1:
+        refused = "further steps (trainer.unroll) are taken operation by operation"
     if ranks > 1 or settings.activation_checkpointing:
         refused = "several processes and trainer.activation_checkpointing have updates operation by operation alone"
     if mode == "auto":
