@@ -23,7 +23,7 @@ test: style
 tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
-slow: $(VENV)/.dev
+slow: $(VENV)/.dev $(VENV)/.docs
 	$(BIN)/python -m pytest -m slow
 
 # Hours: the stability map, its page in outputs/envelope, and the section of hood/studies/notes/stability.md that is written from it.

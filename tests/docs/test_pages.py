@@ -83,4 +83,4 @@ def test_the_citation_is_that_of_the_readme_and_of_this_version() -> None:
 def test_the_list_for_language_models_names_every_page() -> None:
     text = (ROOT / "docs" / "llms.txt").read_text(encoding="utf-8")
     pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert set(re.findall(r"\((\w+\.md)\)", text)) == pages
+    assert set(re.findall(r"\]\(([^)]+)\)", text)) == pages

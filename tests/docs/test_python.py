@@ -18,7 +18,11 @@ WITH_PYTHON = [page for page in PAGES if page.name not in ELSEWHERE and any(b.la
 MISSING = re.compile(r"my_\w+\.(obj|npz)")
 
 #: What pages print, as far as they promise it.
-PRINTED = {"README.md": ("2 torch.Size([",), "python.md": ("2 torch.Size([", "(169, 3)", "3 1016", "True", "(3, 1016, 3)")}
+PRINTED = {
+    "README.md": ("2 torch.Size([",),
+    "python.md": ("2 torch.Size([", "(169, 3)", "3 1016", "True", "(3, 1016, 3)"),
+    "gradients.md": ("tensor(", "{'lame_mu': ", " mm"),
+}
 
 
 def run_page(page: Path) -> None:
