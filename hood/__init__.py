@@ -22,6 +22,7 @@ _HOMES = {
     "rollout": "hood.api",
     "dress": "hood.api",
     "differentiable": "hood.api",
+    "step": "hood.rollouts.gradients",
     "fit": "hood.app.fit",
     "export": "hood.api",
     "view": "hood.app.output.view",

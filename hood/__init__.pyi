@@ -20,6 +20,7 @@ from hood.assets.motion.animated_mesh import BodyMesh as BodyMesh
 from hood.assets.motion.sequence import PoseSequence as PoseSequence
 from hood.rollouts.file.batches import RolloutBatches as RolloutBatches
 from hood.rollouts.file.dataset import RolloutDataset as RolloutDataset
+from hood.rollouts.gradients import step as step
 from hood.rollouts.file.reader import RolloutData as RolloutData, read_rollout as read_rollout
 from hood.steppers.published import load_reference_checkpoint as load_reference_checkpoint
 from hood.energies.potential import Potential as Potential, default_potential as default_potential

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 from tqdm import tqdm
 
@@ -30,17 +29,20 @@ from hood.app.stepping.guarding import GuardStopped, make_guard
 from hood.assets.body.body import Body
 from hood.assets.files.library import locate
 from hood.assets.garment.garment import Garment, checked_garment
-from hood.assets.material import Material
+from hood.assets.material import NO_GRADIENT, Material
 from hood.assets.motion.animated_mesh import BodyMesh
 from hood.assets.motion.sequence import PoseSequence, checked_sequence
 from hood.cloth.cloth import with_values
+from hood.cloth.state import State
 from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
+from hood.rollouts.differentiable import precision_of
 from hood.rollouts.frame import Frame
-from hood.rollouts.gradients import DifferentiableFrames
+from hood.rollouts.gradients import DifferentiableFrames, constants_of, followed_stepper
 from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper
-from hood.steppers.newton import NewtonStepper, Stepper, require_stepper
+from hood.steppers.newton import Stepper, require_stepper
+from hood.steppers.protocol import Relaxing
 from hood.tensors.batch import to_device
 
 
@@ -75,6 +77,10 @@ class Simulation:
 
     def __len__(self) -> int:
         return self.num_frames
+
+    def start(self) -> State:
+        """The state of frame 0, on the body, where :func:`hood.step` may begin."""
+        return next(iter(self)).state
 
     def __iter__(self) -> Iterator[Frame]:
         config = self._ready.config
@@ -149,6 +155,9 @@ def simulate(
         named["stepper"] = stepper
     else:
         require_stepper(stepper)
+        for name, value in constants_of(getattr(stepper, "potential", None)).items():
+            if getattr(value, "requires_grad", False):
+                raise ConfigError(f"stepper: {name}: {NO_GRADIENT}")
         named["stepper"] = "network"  # what may be said of a network's steps may be said of these
     plans = plan_path(named) is not None or plan_accuracy(named) is not None
     key = "accuracy" if named.get("accuracy") is not None else "plan" if plans else None
@@ -174,20 +183,29 @@ def differentiable(
     potential: Potential | None = None,
     rest_pos: Tensor | None = None,
     flat: Tensor | None = None,
+    *,
+    start: State | None = None,
+    window: int | None = None,
     **fabric: Tensor | float,
 ) -> DifferentiableFrames:
-    """States of the frames 1, 2, … of a simulation by the solver, as functions that torch differentiates.
+    """States of the frames 1, 2, … of a simulation, as functions that torch differentiates.
 
-    Every step ends at the minimum of one known potential, so that its derivative is exact (implicit function theorem): contact,
-    friction, layers of cloth and air included, to the accuracy that ``solver.target_rg`` asks for. What is nearest to what, and
-    frame 0, are constant. Memory grows by the states and contacts of the frames. Everything is float64.
+    By the solver every step ends at the minimum of one known potential, so that its derivative is exact (implicit function
+    theorem): contact, friction, layers of cloth and air included, to the accuracy that ``solver.target_rg`` asks for. By a
+    network it is the network's own, of everything that it is told. What is nearest to what is constant, and so is frame 0 if it
+    is not given. Memory grows by the states and contacts of the frames. The solver computes in float64, a network in float32,
+    or in float64 where a tensor of that is given.
 
     Args:
-        simulation: by ``stepper="newton"``.
+        simulation: by ``stepper="newton"`` or ``"network"``; steps that are refined to an unbalanced force, as by
+            ``refine="0.01rg"``, are taken by the solver, as far.
         num_frames: including frame 0; default those of the simulation.
         gravity: (3,) m/s².
         potential: with constants that are tensors; default that of the simulation.
         rest_pos, flat: (V, 3) and (F, 2, 2) m, the rest shape; see :func:`hood.cloth.cloth.with_values`.
+        start: frame 0, whose positions and velocities may be differentiated; default ``simulation.start()``.
+        window: gradients go back through at most so many steps: the state at every so many frames is a constant to the frames
+            after it. Default: through all.
         fabric: ``lame_mu``, ``density``, …: one number or as many as there are faces, hinges (``bending_stiffness``) or
             vertices (``friction``).
 
@@ -196,7 +214,7 @@ def differentiable(
         state.pos``. Its :meth:`hood.rollouts.gradients.DifferentiableFrames.gradients` says how exact gradients are.
 
     Raises:
-        ValueError: another stepper, a value that does not fit, an event that cuts the cloth, or a body that jumps.
+        ValueError: a stepper whose steps have no known derivative, or a value that does not fit.
 
     Examples:
         >>> import hood, torch
@@ -207,17 +225,15 @@ def differentiable(
         >>> bool(mu.grad > 0)  # harder cloth hangs higher
         True
     """
-    stepper = simulation.stepper
-    if not isinstance(stepper, NewtonStepper):
-        raise ConfigError(f"simulation: its steps are taken by {type(stepper).__name__}; give hood.simulate(stepper='newton')")
-    stepper = stepper if potential is None else NewtonStepper(potential, stepper.settings)
     count = simulation.num_frames if num_frames is None else min(num_frames, simulation.num_frames)
-    start = next(iter(simulation)).state
-    cloth = with_values(to_device(simulation.scene.cloth, dtype=torch.float64), rest_pos, flat, **fabric)
     given = {"gravity": gravity, "rest_pos": rest_pos, "flat": flat, **fabric}
-    given |= {f"{name}.{key}": value for name, term in stepper.potential.terms.items() for key, value in vars(term).items()}
+    given |= constants_of(potential or simulation.potential)
+    given |= {} if start is None else {"start.pos": start.pos, "start.vel": start.vel}
+    stepper = followed_stepper(simulation, potential, given)
+    cloth = with_values(to_device(simulation.scene.cloth, dtype=precision_of(stepper)), rest_pos, flat, **fabric)
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
-    return DifferentiableFrames(stepper, simulation.scene, start, count - 1, cloth, gravity, tensors)
+    state, relaxing = simulation.start() if start is None else start, stepper.relaxing is Relaxing.RESTART
+    return DifferentiableFrames(stepper, simulation.scene, state, count - 1, cloth, gravity, tensors, window, relaxing)
 
 
 def _own(garment: Any, body: Any, sequence: Any, material: Any) -> tuple[Own, dict[str, Any]]:

@@ -21,6 +21,8 @@ MODULES = {
     "hood/assets/motion/layouts/people.py": "who is in a motion file, in one table or an entry a frame",
     "hood/contact/contact.py": "what a contact is, its two searches in two forms, and how its points move",
     "hood/rollouts/adjoint.py": "one derivative of a force, written out or by autograd, and the system behind it",
+    "hood/rollouts/differentiable.py": "one step by a solver or a network, its adjoint, its gap, and the steps of a scene",
+    "hood/rollouts/gradients.py": "one loss and its gradients: frames, an estimate of their error, a step for own loops",
     "hood/native/build.py": "one way to a compiled library: at hand, from a wheel, or made",
     "hood/assets/pattern/bottoms.py": "designs of one kind, each a draft of its panels",
     "hood/assets/pattern/fronts.py": "what opens in front: panels, collars and lapels drawn, then cut open once they are sewn",

@@ -6,10 +6,12 @@ import ast
 import doctest
 import importlib
 import inspect
-import re
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -244,23 +246,63 @@ def test_no_stepper_is_refused_by_name() -> None:
         hood.simulate("tank", "plie", num_frames=2, stepper=None)  # type: ignore[arg-type]
 
 
-def test_tensors_with_a_gradient_are_refused_where_it_would_be_dropped() -> None:
-    value, vertices = torch.tensor(3e4, requires_grad=True), torch.ones(1016, requires_grad=True)
-    moved = torch.as_tensor(hood.load_garment("tank").rest_pos).requires_grad_()
-    cases = [
-        ("material.lame_mu", lambda: hood.simulate("tank", material={"lame_mu": value})),
-        ("material", lambda: hood.simulate("tank", material=hood.Material(lame_mu=vertices))),
-        ("material", lambda: hood.Material(lame_mu=hood.FaceField(vertices))),  # type: ignore[arg-type]
-        ("wind", lambda: hood.simulate("tank", wind=[value, 0.0, 0.0])),
-        ("betas", lambda: hood.simulate("tank", betas=vertices[:3])),
-        ("solver.target_rg", lambda: hood.simulate("tank", solver={"target_rg": value})),
-        ("garment 'mine': rest_pos", lambda: hood.simulate(own_garment(rest_pos=moved))),
-    ]
-    for key, call in cases:
-        with pytest.raises(ValueError, match=f"^{key}: its tensor requires a gradient, .*; give value.detach") as told:
-            call()
-        assert "\n" not in str(told.value)
-    assert hood.Material(lame_mu=vertices.detach() * 2e4).lame_mu is not None
+def _following(count: int = 0) -> Any:
+    return torch.ones(count or (), requires_grad=True)
+
+
+def _of_arrays(given: Any, key: str) -> Any:
+    """Something of arrays, one of them a tensor with a gradient."""
+    return replace(given, **{key: torch.as_tensor(getattr(given, key)).requires_grad_()})
+
+
+def _built(**keys: Any) -> Any:
+    usual = {"garment": hood.load_garment("tank"), "body": hood.load_body(), "sequence": hood.load_sequence("plie")}
+    return hood.build_scene(**usual | keys)
+
+
+#: Where a tensor could be given, and what names it in the sentence that refuses it.
+GIVEN: list[tuple[str, Callable[[], Any]]] = [
+    ("material.lame_mu", lambda: hood.simulate("tank", material={"lame_mu": _following()})),
+    ("material", lambda: hood.simulate("tank", material=hood.Material(lame_mu=_following(1016)))),
+    ("material", lambda: hood.Material(lame_mu=hood.FaceField(_following(8)))),
+    ("material", lambda: hood.Material(bending_stiffness=hood.EdgeField(_following(8)))),
+    ("wind", lambda: hood.simulate("tank", wind=[_following(), 0.0, 0.0])),
+    ("gravity", lambda: hood.simulate("tank", gravity=_following())),
+    ("size", lambda: hood.simulate("tank", size=_following())),
+    ("size", lambda: hood.simulate("tank", size={"sleeves": _following()})),
+    ("betas", lambda: hood.simulate("tank", betas=_following(3))),
+    ("fps", lambda: hood.simulate("tank", fps=_following())),
+    ("solver.target_rg", lambda: hood.simulate("tank", solver={"target_rg": _following()})),
+    (
+        "losses.terms.friction.coefficient",
+        lambda: hood.simulate("tank", losses={"terms": {"friction": {"coefficient": _following()}}}),
+    ),
+    (
+        "stepper: friction.coefficient",
+        lambda: hood.simulate("tank", stepper=NewtonStepper(hood.default_potential(friction_coefficient=_following()))),
+    ),
+    ("garment 'tank': rest_pos", lambda: hood.simulate(_of_arrays(hood.load_garment("tank"), "rest_pos"))),
+    ("garment 'tank': rest_pos", lambda: hood.simulate([_of_arrays(hood.load_garment("tank"), "rest_pos")])),
+    ("body 'default': v_template", lambda: hood.simulate("tank", body=_of_arrays(hood.load_body(), "v_template"))),
+    ("sequence: poses", lambda: hood.simulate("tank", _of_arrays(hood.load_sequence("plie"), "poses"))),
+    ("body: vertices", lambda: hood.BodyMesh(torch.ones(3, 4, 3, requires_grad=True), np.array([[0, 1, 2]]))),  # type: ignore[arg-type]
+    ("size", lambda: _built(size=_following())),
+    ("size", lambda: _built(size=[_following(), 1.0, 1.0])),
+    ("betas", lambda: _built(betas=_following(10))),
+    ("garment 'tank': rest_pos", lambda: _built(garment=_of_arrays(hood.load_garment("tank"), "rest_pos"))),
+    ("material.density", lambda: hood.rollout(garment="tank", material={"density": _following()})),
+    ("material.density", lambda: hood.dress(garments=["tank"], material={"density": _following()})),
+    ("size", lambda: hood.fit(garment="tank", size=_following())),
+    ("trainer.learning_rate", lambda: hood.train(trainer={"learning_rate": _following()})),
+    ("fps", lambda: hood.export("none", fps=_following())),
+]
+
+
+@pytest.mark.parametrize(("key", "call"), GIVEN, ids=[f"{number}-{key}" for number, (key, _) in enumerate(GIVEN)])
+def test_tensors_with_a_gradient_are_refused_where_it_would_be_dropped(key: str, call: Callable[[], Any]) -> None:
+    with pytest.raises(ValueError, match=f"^{key}: its tensor requires a gradient, .* hood.differentiable does; give") as told:
+        call()
+    assert "\n" not in str(told.value)
 
 
 def test_numbers_and_arrays_of_numpy_and_torch_are_numbers_and_lists() -> None:
@@ -289,8 +331,3 @@ def test_a_simulation_takes_tables_and_events() -> None:
     longer = shirt.scene.cloth.rest_area.sum() / plain_shirt.scene.cloth.rest_area.sum()
     assert 1.02 < float(longer) < 1.21
     assert len(shirt.scene.cloth.lame_mu.unique()) == 2
-
-
-def test_the_page_on_python_lists_every_public_name() -> None:
-    table = (PACKAGE.parent / "docs" / "python.md").read_text(encoding="utf-8").partition("## All names")[2]
-    assert set(re.findall(r"`(\w+)(?:\(.*?\))?`", table)) - {"motions", "weights"} >= set(hood._HOMES) - {"names"}

@@ -106,6 +106,7 @@ class Material:
 
     @staticmethod
     def names() -> tuple[str, ...]:
+        """Names of the properties."""
         return tuple(spec.name for spec in fields(Material))
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ Warp of a garment's faces: where the threads run that go along a piece of the pa
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -112,10 +112,11 @@ class Cloth:
     weave: Tensor | None = None  # (F, 3) factors on its stiffness along the warp, along the weft and in shear
     grain: Tensor | None = None  # (F, 2) warp as shares of the edges x₁ - x₀ and x₂ - x₀; zero where it plays no role
     flat: Tensor | None = None  # (F, 2, 2) m, those edges in the flat pattern (:mod:`hood.mesh.flat`); None: as in rest_pos
-    num_scenes: int = 1
+    num_scenes: int = 1  # B
 
     @property
     def num_vertices(self) -> int:
+        """V, of all garments together."""
         return self.rest_pos.shape[0]
 
     @cached_property
@@ -313,6 +314,7 @@ def with_values(cloth: Cloth, rest_pos: Tensor | None = None, flat: Tensor | Non
     """
     fields = {"bending_stiffness": cloth.hinge_area, "friction": cloth.mass}
     changed: dict[str, Any] = {}
+    told: dict[str, Tensor] = {}
     for name, value in fabric.items():
         if name not in ("density", "lame_mu", "lame_lambda", "thickness", *fields):
             raise ValueError(f"cloth: {name!r} is no number of a fabric; give density, lame_mu, lame_lambda, thickness, "
@@ -321,7 +323,8 @@ def with_values(cloth: Cloth, rest_pos: Tensor | None = None, flat: Tensor | Non
         given = torch.as_tensor(value, dtype=like.dtype)
         if given.shape not in ((), like.shape):
             raise ValueError(f"cloth: {name} has the shape {tuple(given.shape)}; give one number or {tuple(like.shape)}")
-        changed[name] = given.expand(like.shape)
+        changed[name], told[name] = given.expand(like.shape), given
+    changed |= _features(cloth, told)
     density = changed.get("density", cloth.density)
     if (rest_pos is not None or flat is not None) and cloth.weave is not None:
         raise ValueError("cloth: its fabric has a warp; the rest shape of an isotropic one can be changed")
@@ -362,6 +365,41 @@ def _without_grain(cloth: Cloth) -> Cloth:
     """An isotropic cloth as one with a weave: the same energy to rounding."""
     like, count = cloth.rest_area, len(cloth.faces)
     return replace(cloth, weave=like.new_ones(count, 3), grain=like.new_zeros(count, 2))
+
+
+def _features(cloth: Cloth, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """``vertex_fabric`` and ``edge_fabric`` of a cloth with other values, each one number or as many as :func:`with_values`
+    takes, by the rules of :mod:`hood.cloth.fabric`. An edge without a hinge bends as its ends do."""
+    if not any(name in told for name in _FEATURES):
+        return {}
+    columns = [list(cloth.vertex_fabric.unbind(dim=1)), list(cloth.edge_fabric.unbind(dim=1))]
+    for place, name in enumerate(_FEATURES):
+        values = told.get(name)
+        if values is None:
+            continue
+        if values.ndim == 0:
+            columns[0][place], columns[1][place] = (values.expand(len(rows[place])) for rows in columns)
+            continue
+        edges, elements, weight = cloth.edges.cpu().numpy(), cloth.faces, cloth.rest_area.detach()
+        if name == "bending_stiffness":
+            elements, weight = cloth.hinges[:, :2], torch.ones_like(cloth.hinge_area)
+            sides = elements
+        else:
+            sides = elements[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        of_vertices = _around(elements, values, weight, cloth.num_vertices, values.mean())
+        at = torch.as_tensor(topology.edge_index(edges, sides.cpu().numpy()), device=values.device).view(len(values), -1)
+        ends = of_vertices[cloth.edges].mean(dim=1)
+        columns[0][place] = of_vertices
+        columns[1][place] = _around(at, values, torch.ones_like(weight), len(cloth.edges), ends)
+    return {"vertex_fabric": torch.stack(columns[0], dim=1), "edge_fabric": torch.stack(columns[1], dim=1)}
+
+
+def _around(elements: Tensor, values: Tensor, weight: Tensor, count: int, other: Tensor) -> Tensor:
+    """Weighted means (count,) of ``values`` (N,) of the elements (N, C) around; ``other`` where there is none."""
+    shares = torch.stack([weight * values, weight], dim=1).repeat_interleave(elements.shape[1], dim=0)
+    total = add_rows(shares.new_zeros(count, 2), elements.reshape(-1), shares)
+    some = total[:, 1] > 0
+    return torch.where(some, total[:, 0] / torch.where(some, total[:, 1], 1.0), other)
 
 
 #: What vertex_fabric and edge_fabric hold, in this order.

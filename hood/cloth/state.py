@@ -51,9 +51,9 @@ class StepInput:
     """Everything prescribed from outside for the step t → t+1."""
 
     dt: Tensor  # (B,) s
-    obstacle: Obstacle | None = None
+    obstacle: Obstacle | None = None  # the body; None: there is none
     pin_target: Tensor | None = None  # (V, 3) m local at t + 1; read at pinned vertices and those of ``pin_stiffness``
-    attachments: Attachments | None = None
+    attachments: Attachments | None = None  # pairs of vertices that are pulled together; None: there are none
     time: Tensor | None = None  # (B,) s since frame 0, at t + 1; what changes by itself (gusts) reads it, None: 0
     pin_stiffness: Tensor | None = None  # (V,) N/m of springs to ``pin_target`` (SoftPins), 0: none; None: nowhere
 

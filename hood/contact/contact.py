@@ -83,7 +83,7 @@ class SecondContact:
     """The other side of folds of the body: of vertices between two parts of the skin that face each other, as in the bend of an
     elbow, contact with the one that is not nearest. Everything else is not ``valid``; None where nothing is."""
 
-    contact: Contact | None
+    contact: Contact | None  # rows of all vertices; None: no fold is near
 
     def to(self, dtype: torch.dtype) -> SecondContact:
         """The same with its numbers in ``dtype``."""
@@ -161,7 +161,8 @@ def skin_of(obstacle: Obstacle) -> BodyAtVertices:
         given = obstacle.faces, incidence.adjacency
         found, next_found = (tree.vertex_skin(pos, *given, curved) for pos, curved in zip(both, (True, False), strict=True))
         if found is not None and next_found is not None:
-            return BodyAtVertices(found[0], next_found[0], found[1])
+            like = obstacle.pos.dtype  # the compiled pass computes in float64
+            return BodyAtVertices(*(part.to(like) for part in (found[0], next_found[0], found[1])))
     now, later = (geometry.normals_of_fans(pos, obstacle.faces, incidence.around, incidence.first) for pos in both)
     return BodyAtVertices(now, later, convex_curvature(obstacle.pos, obstacle.faces, incidence))
 

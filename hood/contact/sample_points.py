@@ -10,7 +10,7 @@ How far off the body contact holds the cloth's vertices so that the flat triangl
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -18,9 +18,10 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.cloth.state import Obstacle
-from hood.contact.contact import Contact, match_surface
+from hood.contact.contact import Contact, find_contact, match_surface, moving_contacts
 from hood.mesh import topology
 from hood.mesh.closest_point.search import build_incidence
+from hood.mesh.closest_point.tree import Match
 from hood.mesh.flat import masses
 from hood.mesh.geometry import normals_of_fans, vertex_masses
 from hood.tensors.batch import made_of
@@ -63,7 +64,8 @@ class PointContact:
 
 
 def find_point_contact(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, contact: Contact) -> PointContact:
-    """Contact of the points of a cloth at ``pos`` (V, 3) with the obstacle at t.
+    """Contact of the points of a cloth at ``pos`` (V, 3) with the obstacle at t, which autograd follows where these require it:
+    which points are matched, with which faces, edges and corners, is constant.
 
     Args:
         place: ``edges``: all edges' midpoints. ``strict``: midpoints of edges with one face, and the points of faces that are
@@ -118,7 +120,7 @@ def _match_midpoints(place: str, middles: _Midpoints, pos: Tensor, obstacle: Obs
     # No nearer than an end less the way from there.
     middles = middles.take((contact.dist[ends].abs().amax(dim=1) - half <= _CAP).nonzero().squeeze(1))
     start, end = pos[middles.vertices[:, 0]], pos[middles.vertices[:, 1]]
-    match = match_surface(0.5 * (start + end), middles.scene, obstacle)
+    match = _matched(0.5 * (start + end), middles.scene, obstacle)
     rows = (match.dist.abs() <= _CAP).nonzero().squeeze(1)
     middles = middles.take(rows)
     weights = pos.new_tensor([0.5, 0.5, 0.0]).expand(len(rows), 3)
@@ -131,7 +133,7 @@ def _match_skin(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, conta
     rows = _near(cloth, pos, obstacle)
     then, later = obstacle.pos[rows], obstacle.next_pos[rows]
     surface = Obstacle(pos, pos, pos, cloth.faces, cloth.vertex_scene, cloth.face_scene)
-    match = match_surface(then, obstacle.vertex_scene[rows], surface)
+    match = _matched(then, obstacle.vertex_scene[rows], surface)
     incidence = build_incidence(obstacle.faces, len(obstacle.pos))
     normal, next_normal = (
         normals_of_fans(at, obstacle.faces, incidence.around, incidence.first, rows) for at in (obstacle.pos, obstacle.next_pos)
@@ -151,6 +153,14 @@ def _match_skin(place: str, cloth: Cloth, pos: Tensor, obstacle: Obstacle, conta
     one_of = incidence.around[incidence.first[rows]]
     found = (values[kept] for values in (across, then, later, next_normal, one_of))
     return PointContact(place, vertices, weights, obstacle.vertex_scene[rows[kept]], share, *found)
+
+
+def _matched(at: Tensor, scene: Tensor, surface: Obstacle) -> Match | Contact:
+    """The closest points of a surface to ``at`` (N, 3) at t, as functions of both."""
+    if not any(pos.requires_grad for pos in (at, surface.pos, surface.next_pos)):
+        return match_surface(at, scene, surface)
+    still = replace(surface, pos=surface.pos.detach(), next_pos=surface.next_pos.detach(), prev_pos=surface.prev_pos.detach())
+    return moving_contacts(find_contact(at.detach(), scene, still, _CAP), None, at, surface)[0]
 
 
 def _near(cloth: Cloth, pos: Tensor, obstacle: Obstacle) -> Tensor:

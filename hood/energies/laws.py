@@ -1,8 +1,9 @@
 """The scalar laws of contact and friction, each with its slope and curvature: what training, solver and refinement compute.
 
 The compiled forms take the same laws from ``hood/native/laws.h``. A friction law f(y) must be flat at 0, twice
-differentiable, have f'' <= f' / y, and be y from the limit on: the solvers rely on it. Orders of operations are part of a law:
-results of earlier versions stay the same to the last bit.
+differentiable, have f'' <= f' / y, and be y from the limit on: the solvers rely on it. :func:`mollified_norm` takes the square
+of the slip; ``friction_curvature`` in C++ holds the force. Orders of operations are part of a law: results of earlier versions
+stay the same to the last bit.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class Pressure(Energy):
             raise ValueError(
                 f"pressure: pascal is {pascal}; give Pa from {-_MOST:g} to {_MOST:g}, one atmosphere (10 is a lot)"
             )
-        self.pascal = float(pascal)
+        self.pascal = pascal if isinstance(pascal, Tensor) else float(pascal)  # steps are differentiated by a tensor
 
     def applies(self, problem: StepProblem) -> bool:
         return self.pascal != 0.0

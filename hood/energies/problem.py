@@ -35,16 +35,16 @@ class StepProblem:
     presses it onto the skin; None where nobody has asked :meth:`hood.energies.potential.Potential.with_internal_force`.
     """
 
-    cloth: Cloth
-    state: State
-    step: StepInput
-    contact: Contact | None = None
+    cloth: Cloth  # topology, rest shape and fabric
+    state: State  # at t
+    step: StepInput  # what is prescribed for t → t + 1
+    contact: Contact | None = None  # with the body
     gravity: Tensor = field(default_factory=_standard_gravity)  # (3,) m/s²
-    point_contacts: tuple[PointContact, ...] = ()
+    point_contacts: tuple[PointContact, ...] = ()  # with the body, at points inside edges and faces
     internal_force: Tensor | None = None  # (V, 3) N
     layers: tuple[SceneLayers, ...] = ()  # one per scene, or none
-    sides: LayerPairs | None = None
-    second_contact: SecondContact | None = None
+    sides: LayerPairs | None = None  # of cloth near cloth
+    second_contact: SecondContact | None = None  # with the other side of folds of the body
 
     def __post_init__(self) -> None:
         if len(self.step.dt) != self.cloth.num_scenes:
@@ -54,6 +54,7 @@ class StepProblem:
 
     @property
     def num_scenes(self) -> int:
+        """B."""
         return self.cloth.num_scenes
 
     def with_contact(self) -> StepProblem:
@@ -220,6 +221,7 @@ class StepProblem:
         return (next_pos - self.state.pos - dt * self.state.vel) / dt**2
 
     def sum_vertices(self, values: Tensor) -> Tensor:
+        """Sums (B,) per scene of ``values`` (V,) of vertices."""
         return sum_per_scene(values, self.cloth.vertex_scene, self.num_scenes)
 
 

@@ -181,12 +181,12 @@ def _pressing(problem: StepProblem, pairs: _Pairs) -> Tensor:
     there = torch.where(cloth.free.unsqueeze(1), ballistic_position(problem), _held(problem))
     inertia = cloth.mass.double() / problem.vertex_dt.squeeze(1).double() ** 2
     backing = ~cloth.free | _on_body(problem)
-    vectors = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there)
-    if any(values.requires_grad for values in vectors):
-        return _followed_pressing(pairs, inertia, there, problem.internal_force, backing)
+    vectors, around = (pairs.weights, pairs.normal, pairs.force, pairs.reach, inertia, there), problem.internal_force
+    if any(values.requires_grad for values in vectors) or (around is not None and around.requires_grad):
+        return _followed_pressing(pairs, inertia, there, around, backing)
     arrays = [np.ascontiguousarray(values.cpu().numpy(), np.int64) for values in (pairs.corners, pairs.edges)]
     arrays += [np.ascontiguousarray(values.double().cpu().numpy()) for values in vectors]
-    pull = None if problem.internal_force is None else np.ascontiguousarray(problem.internal_force.double().cpu().numpy())
+    pull = None if around is None else np.ascontiguousarray(around.double().cpu().numpy())
     backed = np.ascontiguousarray(backing.cpu().numpy(), np.uint8)
     pointers = [array.ctypes.data for array in arrays] + [None if pull is None else pull.ctypes.data, backed.ctypes.data]
     pressing = np.empty(len(pairs.force))

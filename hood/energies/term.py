@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 class Role(Enum):
     """What an energy is for; its subclasses inherit it."""
 
-    INERTIA = "inertia"
-    GRAVITY = "gravity"
+    INERTIA = "inertia"  # against acceleration
+    GRAVITY = "gravity"  # weight
     ELASTIC = "elastic"  # of the cloth and what is sewn to it
-    DAMPING = "damping"
+    DAMPING = "damping"  # of the fabric
     EXTERNAL = "external"  # of the air around
     CONTACT = "contact"  # with the body
-    FRICTION = "friction"
+    FRICTION = "friction"  # on the body
     SELF_CONTACT = "self_contact"  # of cloth with cloth
-    SELF_FRICTION = "self_friction"
+    SELF_FRICTION = "self_friction"  # of cloth on cloth
     TRAINING = "training"  # for training alone: the solver takes none of them
 
 

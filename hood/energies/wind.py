@@ -71,6 +71,9 @@ class Wind(Energy):
     ) -> None:
         if len(velocity) != 3 or not all(math.isfinite(value) for value in velocity):
             raise ValueError(f"wind: velocity is {list(velocity)}; give three numbers [x, y, z] in m/s")
+        for name, value in {"gusts": gusts, "gust_time": gust_time}.items():
+            if isinstance(value, Tensor):
+                raise ValueError(f"wind: {name} is a tensor, by which steps have no derivative; give a number")
         named = {"drag": drag, "friction": friction, "density": density, "gusts": gusts}
         for name, value in named.items():
             if not (math.isfinite(value) and value >= 0):

@@ -64,6 +64,9 @@ def write_course(values: Sequence[float], title: str, across: str, path: Path) -
     figure = Figure(figsize=(5.0, 3.0), layout="constrained")
     axes = figure.subplots()
     axes.semilogy(range(len(values)), [max(value, 1e-9) for value in values], marker="o", markersize=3, color=COLOURS[0])
+    if max(values) < 10.0 * min(values):  # no or one power of ten on the axis: numbers between them
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
     axes.set_title(title, loc="left", fontsize=10)
     axes.set_xlabel(across, fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)

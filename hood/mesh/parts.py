@@ -151,6 +151,7 @@ class Riders:
 
     @property
     def num_groups(self) -> int:
+        """How many groups there are."""
         return int(self.group.max(initial=-1)) + 1
 
     @property

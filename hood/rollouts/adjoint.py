@@ -7,20 +7,19 @@ compiler, are found by autograd, which differentiates their energies twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hood.cloth.cloth import Cloth
-from hood.contact.contact import moving_contacts
-from hood.contact.sample_points import edge_growth
+from hood.contact.contact import CentroidContact, moving_contacts
+from hood.contact.sample_points import edge_growth, find_point_contact
 from hood.energies import compiled_elements
 from hood.energies.bending import bending_weight
-from hood.energies.laws import slip_slope
 from hood.energies.membrane import weave_roots
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem, dot_rows
@@ -30,17 +29,91 @@ from hood.native.build import BuildError
 from hood.solver.compiled import newton
 from hood.solver.compiled.system import CompiledSystem
 from hood.solver.derivatives.compiled_vertices import FollowedBody
-from hood.solver.derivatives.vertices import VertexForces, split, vertex_forces
+from hood.solver.derivatives.vertices import force_of, split, vertex_forces
+from hood.solver.newton import NewtonSettings, minimize
 from hood.solver.system.iterate import fixed_positions
 from hood.solver.system.linear import beside, by_blocks, conjugate_gradients, diagonal_inverse, product
 from hood.solver.system.plan import SolverPlan, plan_for, quadratic_model
+from hood.tensors.batch import given_in, without_gradient
 
 #: Systems with the Hessian, in float32, are solved to the first number, those with the solver's matrix, which stands in for it,
 #: to the second.
 _EXACT, _NEAR, _MOST_ITERATIONS = 1e-5, 1e-3, 4000
+#: The adjoint system is solved to this share of its right-hand side, in at most so many products with the Hessian, from as many
+#: vectors as are kept at a time.
+_TOLERANCE, _MOST_PRODUCTS, _MOST_KEPT = 1e-9, 300, 60
+#: Negative curvature below this share of the greatest is none.
+_ROUNDING = 1e-10
+
+#: Names of what a step finds itself, and of constants that act through what is found in a step or known of a term beforehand.
+_FOUND = ("contact", "second_contact", "point_contacts", "internal_force", "layers", "sides")
+_CONSTANT = {"LayerBarrier": ("reach",), "Wind": ("gusts", "gust_time")}
 
 #: A tensor that autograd follows, and how something changes with it.
 Slope = tuple[Tensor, Tensor]
+
+
+def check_given(problem: StepProblem, potential: Potential) -> None:
+    """Raise ValueError where a step would drop what depends on a tensor with a gradient."""
+    name = next((name for name in _FOUND if given_in(getattr(problem, name))), None)
+    if name is not None:
+        raise ValueError(
+            f"differentiable step: {name} of the problem has a tensor with a gradient, but every step finds it itself; give "
+            "the body's positions as step.obstacle"
+        )
+    kinds = {kind_of(term) for term in potential.terms.values()}
+    for key, term in potential.terms.items():
+        constant = _CONSTANT.get(kind_of(term), ())
+        if "LayerFriction" in kinds and kind_of(term) == "LayerBarrier":  # which lags the force of the other
+            constant = (*constant, "pressure")
+        wrong = next((one for one in constant if given_in(getattr(term, one, None))), None)
+        if wrong is not None:
+            raise ValueError(f"differentiable step: {key}.{wrong} has no derivative; give a number")
+    springs = problem.step.pin_stiffness
+    if springs is not None and "SoftPins" not in kinds and (springs.requires_grad or bool(springs.any())):
+        raise ValueError(
+            "differentiable step: the step has soft pins, but the potential has no term for them; give "
+            "hood.energies.potential.with_soft_pins(potential)"
+        )
+
+
+def check_taken(problem: StepProblem, potential: Potential, taken: StepProblem, pos: Tensor) -> None:
+    """Raise ValueError where a step that was ``taken`` to ``pos`` (V, 3) would drop what depends on a tensor with a gradient;
+    ``potential`` and ``taken`` have numbers alone."""
+    hidden = _depends_on_others(potential, taken, pos)
+    if hidden is not None:
+        raise ValueError(
+            f"differentiable step: the term {hidden} depends on a tensor with a gradient that is none of its attributes; "
+            "make it one (a list, a dict or a module of tensors is as good)"
+        )
+    obstacle = problem.step.obstacle
+    body = [] if obstacle is None else [obstacle.pos, obstacle.next_pos, obstacle.prev_pos]
+    if isinstance(taken.contact, CentroidContact) and given_in(body):
+        raise ValueError(
+            "differentiable step: a term of the published code finds contact by centroids, which has no derivative by the "
+            "body; give hood.default_potential(), or a body without gradients"
+        )
+
+
+def _depends_on_others(potential: Potential, taken: StepProblem, pos: Tensor) -> str | None:
+    """The name of an own term that depends on a tensor that requires a gradient, apart from the positions: as one that was made
+    around it. None where there is no such term; ``potential`` and ``taken`` have numbers alone."""
+    own = {name: term for name, term in potential.active(taken).items() if not type(term).__module__.startswith("hood.")}
+    at = pos.detach().requires_grad_()
+    for name, term in own.items():
+        with torch.enable_grad():
+            nodes = [term(taken, at, taken.acceleration(at)).grad_fn]
+        seen = set(nodes)
+        while nodes:
+            node = nodes.pop()
+            if node is None:
+                continue
+            if getattr(node, "variable", at) is not at:
+                return name
+            new = {further for further, _ in node.next_functions} - seen
+            seen |= new
+            nodes += new
+    return None
 
 
 def meets(taken: StepProblem, pos: Tensor) -> bool:
@@ -180,49 +253,49 @@ def _reads_contact(term: Term, taken: StepProblem) -> bool:
 
 
 def _with_constant_contacts(problem: StepProblem, taken: StepProblem) -> StepProblem:
-    names = ("contact", "second_contact", "layers", "internal_force")
+    names = ("contact", "second_contact", "point_contacts", "layers", "sides", "internal_force")
     return replace(problem, **{name: getattr(taken, name) for name in names})
 
 
 def with_contacts(potential: Potential, problem: StepProblem, taken: StepProblem) -> StepProblem:
     """The problem with the contacts that its step was taken with, following body and cloth."""
-    obstacle, problem = problem.step.obstacle, replace(problem, layers=taken.layers)
+    obstacle, problem = problem.step.obstacle, replace(problem, layers=taken.layers, sides=taken.sides)
     if obstacle is not None and taken.contact is not None:
         contact, second = moving_contacts(taken.contact, taken.second_contact, problem.state.pos, obstacle)
-        problem = replace(problem, contact=contact, second_contact=second)
+        given = problem.cloth, problem.state.pos, obstacle, taken.contact
+        points = tuple(find_point_contact(known.place, *given) for known in taken.point_contacts)
+        problem = replace(problem, contact=contact, second_contact=second, point_contacts=points)
     internal = potential.asked_internal(problem)
     if internal is None:
         return problem
     return replace(problem, internal_force=-force_of(internal, problem, _apart_from(problem.state.pos)))
 
 
+def following(potential: Potential, problem: StepProblem) -> tuple[StepProblem, StepProblem]:
+    """``problem`` with what the terms of ``potential`` ask of it: as numbers alone, and with contacts that follow its state."""
+    taken = potential.prepare(without_gradient(problem))
+    return taken, with_contacts(potential, replace(problem, step=taken.step), taken)
+
+
+def step_gap(
+    potential: Potential, taken: StepProblem, followed: StepProblem, pos: Tensor, settings: NewtonSettings | None = None
+) -> Tensor:
+    """Φ(``pos``) − Φ(x*) [J] of every scene (B,) at positions (V, 3) at t + 1, with the minimum x* next to them.
+
+    It is differentiable by the positions and the state, with no adjoint system: by the envelope theorem the derivative of a
+    minimum's value by the state is that at the place x*. Its derivative is zero at the minimum, by the state as well.
+
+    Args:
+        taken: and ``followed``: :func:`following`.
+        settings: of the search for x*.
+    """
+    best, _ = minimize(potential, taken, pos.detach(), settings)
+    return potential.total(followed, pos) - potential.total(followed, best)
+
+
 def _apart_from(pos: Tensor) -> Tensor:
     """Positions at t to differentiate by, apart from those that the energies themselves know."""
     return pos.clone() if pos.requires_grad else pos.detach().requires_grad_()
-
-
-def force_of(potential: Potential, problem: StepProblem, pos: Tensor) -> Tensor:
-    """∂Φ/∂x [N] (V, 3) at ``pos`` (V, 3), as a function that autograd follows."""
-    at = pos if pos.requires_grad else pos.detach().requires_grad_()
-    single, rest = split(potential)
-    total = torch.zeros_like(pos)
-    if single.terms:
-        total = _on_vertices(vertex_forces(single, problem), at, problem.acceleration(at))
-    if rest.active(problem):
-        (slope,) = torch.autograd.grad(rest.total(problem, at).sum(), at, create_graph=True)
-        total = total + slope
-    return total
-
-
-def _on_vertices(forces: VertexForces, pos: Tensor, acc: Tensor) -> Tensor:
-    total = replace(forces, grips=()).gradient(pos, acc)
-    for grip in forces.grips:
-        slip = grip.slip(pos)
-        square = dot_rows(slip, slip)
-        slips = square > 0  # the root has no slope at 0
-        size = torch.where(slips, torch.where(slips, square, 1.0).sqrt(), 0.0)
-        total = total + (grip.force * slip_slope(size, grip.limit)).unsqueeze(1) * slip
-    return total
 
 
 class Hessian:
@@ -295,6 +368,52 @@ class Preconditioner:
             if not bool(indefinite.any()):
                 break
         return torch.zeros_like(r).index_copy(0, plan.vertices, found)
+
+
+class Solution(NamedTuple):
+    """λ of H λ = rhs, whether it is that to 1e-7, and whether a direction was seen along which H has negative curvature."""
+
+    value: Tensor  # (V, 3)
+    met: bool
+    indefinite: bool
+
+
+def solve_symmetric(apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], rhs: Tensor) -> Solution:
+    """Solution of a system with a symmetric matrix that need not be definite, ``rhs`` (V, 3), by generalised minimal residuals.
+
+    The preconditioner may differ from time to time (Saad, "A flexible inner-outer preconditioned GMRES algorithm", 1993).
+    Whether the matrix is definite is asked on the space of all preconditioned directions (by its inertia there).
+    """
+    limit, right = _TOLERANCE * rhs.norm(), rhs.reshape(-1)
+    if not bool(torch.isfinite(limit)):
+        return Solution(torch.full_like(rhs, torch.nan), False, False)
+    x, r, left, indefinite = torch.zeros_like(right), right, _MOST_PRODUCTS, False
+    while r.norm() > limit and left > 0:
+        size, rows = float(r.norm()), min(_MOST_KEPT, left)
+        basis, ways = r.new_empty(rows + 1, len(r)), r.new_empty(rows, len(r))
+        column = np.zeros((rows + 1, rows))
+        basis[0], start = r / size, np.eye(1, rows + 1)[0] * size
+        for k in range(rows):
+            left -= 1
+            ways[k] = precondition(basis[k].view_as(rhs)).reshape(-1)
+            q = apply(ways[k].view_as(rhs)).reshape(-1)
+            for _ in range(2):  # orthogonal to rounding
+                share = basis[: k + 1] @ q
+                q = q - share @ basis[: k + 1]
+                column[: k + 1, k] += share.cpu().numpy()
+            column[k + 1, k] = length = float(q.norm())
+            basis[k + 1] = q / length if length > 0 else q
+            known = column[: k + 2, : k + 1]
+            y = np.linalg.lstsq(known, start[: k + 2])[0]
+            missing = start[: k + 2] - known @ y
+            if not np.linalg.norm(missing) > limit or not length > 0:
+                break
+        x = x + torch.from_numpy(y).to(r) @ ways[: k + 1]
+        r = torch.from_numpy(missing).to(r) @ basis[: k + 2]
+        curvature = (ways[: k + 1] @ basis[: k + 2].t()).cpu().numpy() @ known
+        least, *_, most = np.linalg.eigvalsh(curvature + curvature.T)[[0, -1]]
+        indefinite |= bool(least < -_ROUNDING * abs(most))
+    return Solution(x.view_as(rhs), not bool(r.norm() > 1e2 * limit), indefinite)
 
 
 def _compiled(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor) -> CompiledSystem | None:

@@ -34,11 +34,11 @@ from hood.steppers.newton import Stepper
 class Frame:
     """One frame of a rollout."""
 
-    index: int
-    state: State
+    index: int  # from 0
+    state: State  # the simulated cloth, at the precision of the simulation
     world_pos: Tensor  # (V, 3) m float64
     body_pos: Tensor  # (W, 3) m float64
-    metrics: dict[str, float]
+    metrics: dict[str, float]  # by name: strain_p99 [1], relative_gradient [1], energy_… [J], ms_… [ms], …
     fields: dict[str, Tensor] = field(default_factory=dict)  # (V,) by name, of the step that led here; NaN in frame 0
     simulated: bool = True  # False: between two simulated frames, see :mod:`hood.rollouts.frames`
     far: bool = False  # the step that led here ended far from its minimum: the next one is measured too

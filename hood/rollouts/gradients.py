@@ -4,6 +4,11 @@ A derivative is that of the minimum, and a step stops near it. The rollout is ta
 times further: how much the gradients differ is what the first ones are off by, to first order. That holds for the state that a
 step hands on, for the loss and for contacts that set in between the two, of which a linear estimate would know nothing. It
 costs as much as the gradients themselves.
+
+A network's step ends where it ends: its derivative is exact, to rounding, and how far it is from that of the minimum nobody
+knows. Nothing is estimated there.
+
+What takes the steps of a simulation in such rollouts, and one step of it for loops of your own.
 """
 
 from __future__ import annotations
@@ -11,18 +16,28 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
-from hood.cloth.cloth import Cloth
+from hood.cloth.cloth import Cloth, with_values
 from hood.cloth.state import State
-from hood.energies.potential import Potential
-from hood.energies.problem import StepProblem
-from hood.rollouts.differentiable import differentiable_states
-from hood.scene.scene import Scene
+from hood.energies.self_contact import for_networks
+from hood.rollouts.differentiable import differentiable_states, indefinite_at, precision_of, prepare, step_of_scene
 from hood.solver.step_figures import StepFigures
-from hood.steppers.newton import NewtonStepper
+from hood.steppers.network import NetworkStepper
+from hood.steppers.newton import NewtonStepper, Stepper
+from hood.steppers.protocol import Relaxing
+from hood.steppers.refined import RefinedStepper
+from hood.steppers.static_shapes.simulator import network_of
+from hood.steppers.stopping import TargetResidual
+from hood.tensors.batch import made_of, to_device
+
+if TYPE_CHECKING:
+    from hood.energies.potential import Potential
+    from hood.energies.problem import StepProblem
+    from hood.scene.scene import Scene
 
 #: The second rollout goes to this share of the unbalanced force that the first one reached, and no further than the next.
 _FURTHER, _FURTHEST = 1e-2, 1e-11
@@ -44,12 +59,15 @@ class FollowedStep:
         flipped: vertices that are in contact in one of the two rollouts alone: a kink of the derivative is near.
         rematched: vertices whose nearest place on the body is on another face in the other rollout.
         held_off: vertices that were held farther off the body than contact alone does, a choice that has no derivative.
+        indefinite: whether negative curvature was seen where it ended: the solver stopped at no minimum, as where a fold
+            buckles, and the derivative is that of the place without force there.
     """
 
     rg: float
     flipped: int
     rematched: int
     held_off: int
+    indefinite: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,7 +78,8 @@ class Gradients:
         loss: its value.
         by: gradients, by the names of what was given.
         error: what each is off by at most, as a share of it (of its norm): an estimate, see :mod:`hood.rollouts.gradients`.
-        steps: those from frame 0 to 1, 1 to 2, …
+            Empty of networks.
+        steps: those from frame 0 to 1, 1 to 2, …; none of networks.
     """
 
     loss: float
@@ -73,15 +92,22 @@ class Gradients:
         """Steps in or near which the derivative jumps: contacts set in or change their place, or cloth is held off."""
         return [index for index, step in enumerate(self.steps) if step.flipped or step.rematched or step.held_off]
 
+    @property
+    def indefinite(self) -> list[int]:
+        """Steps whose Hessian was indefinite: they ended at no minimum."""
+        return [index for index, step in enumerate(self.steps) if step.indefinite]
+
 
 @dataclass(frozen=True)
 class _Ended:
-    """How a step ended: its rg, vertices in contact (V,), their faces (V,), and how many are held farther off."""
+    """How a step ended: its rg, vertices in contact (V,), their faces (V,), how many are held farther off, and whether its
+    Hessian was indefinite."""
 
     rg: float
     touching: Tensor
     face: Tensor | None
     held_off: int
+    indefinite: bool = False
 
 
 class DifferentiableFrames(Iterator[State]):
@@ -89,25 +115,53 @@ class DifferentiableFrames(Iterator[State]):
 
     Args:
         given: tensors that gradients are taken by, by name; those that require none are left out.
+        window: gradients go back through at most so many steps: the state at every so many frames is a constant to the frames
+            after it. None: through all.
+
+    Raises:
+        ValueError: ``window`` is less than 1.
     """
 
     def __init__(
         self,
-        stepper: NewtonStepper,
+        stepper: NewtonStepper | NetworkStepper,
         scene: Scene,
         start: State,
         num_steps: int,
         cloth: Cloth,
         gravity: Tensor | None,
         given: Mapping[str, Tensor],
+        window: int | None = None,
+        relaxing: bool = False,
     ) -> None:
+        if window is not None and window < 1:
+            raise ValueError(f"differentiable: window is {window}; give at least 1 step, or None for all")
+        self._window, self._relaxing = window, relaxing
         self._stepper, self._scene, self._start, self._num_steps = stepper, scene, start, num_steps
         self._cloth, self._gravity = cloth, gravity
         self._given = {name: value for name, value in given.items() if value.requires_grad}
-        self._states = self._taken(stepper, [])
+        self._states, self._begun = self._taken(stepper, []), False
 
     def __next__(self) -> State:
-        return next(self._states)
+        state = next(self._states)
+        if not self._begun:
+            self._begun = True
+            self._tell_unseen(state)
+        return state
+
+    def _tell_unseen(self, first: State) -> None:
+        """Warn of what a network is not told of: gradients by that are zero."""
+        if not isinstance(self._stepper, NetworkStepper) or not self._given or not torch.is_grad_enabled():
+            return
+        ends = first.pos.sum() + first.vel.sum()
+        found = torch.autograd.grad(ends, list(self._given.values()), retain_graph=True, allow_unused=True)
+        unseen = [name for name, grad in zip(self._given, found, strict=True) if grad is None]
+        if unseen:
+            warnings.warn(
+                f"differentiable: the network is not told of {', '.join(unseen)}: gradients by that are zero; give "
+                "hood.simulate(stepper='newton'), whose steps depend on it",
+                stacklevel=3,
+            )
 
     def gradients(self, loss: Callable[[list[State]], Tensor]) -> Gradients:
         """Gradients of a loss of all states by everything that was given and requires one, and what they are off by.
@@ -128,6 +182,9 @@ class DifferentiableFrames(Iterator[State]):
         """
         if not self._given:
             raise ValueError("gradients: nothing that was given requires a gradient; give tensors with requires_grad=True")
+        if isinstance(self._stepper, NetworkStepper):
+            value, found = self._followed(loss, self._stepper, [])
+            return Gradients(float(value), found, {}, ())
         near: list[_Ended] = []
         far: list[_Ended] = []
         value, found = self._followed(loss, self._stepper, near)
@@ -142,6 +199,7 @@ class DifferentiableFrames(Iterator[State]):
                 int((one.touching != other.touching).sum()),
                 0 if one.face is None or other.face is None else int(((one.face != other.face) & one.touching).sum()),
                 one.held_off,
+                one.indefinite,
             )
             for one, other in zip(near, far, strict=True)
         )
@@ -155,22 +213,28 @@ class DifferentiableFrames(Iterator[State]):
         return Gradients(float(value), found, error, steps)
 
     def _followed(
-        self, loss: Callable[[list[State]], Tensor], stepper: NewtonStepper, ended: list[_Ended]
+        self, loss: Callable[[list[State]], Tensor], stepper: NewtonStepper | NetworkStepper, ended: list[_Ended]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        value = loss([*self._taken(stepper, ended)])
+        states = [*self._taken(stepper, ended)]
+        if states and not self._begun:
+            self._begun = True
+            self._tell_unseen(states[0])
+        value = loss(states)
         if not value.requires_grad:
             raise ValueError(f"gradients: the loss does not depend on {' or '.join(self._given)}; use the states' pos or vel")
         tensors = list(self._given.values())
         # What is given may be the result of something, which both rollouts go back to.
         parts = torch.autograd.grad(value, tensors, allow_unused=True, retain_graph=True)
+        ended[:] = [replace(one, indefinite=indefinite_at(state)) for one, state in zip(ended, states, strict=False)]
         found = [torch.zeros_like(one) if part is None else part for one, part in zip(tensors, parts, strict=True)]
         return value.detach(), dict(zip(self._given, found, strict=True))
 
-    def _taken(self, stepper: NewtonStepper, ended: list[_Ended]) -> Iterator[State]:
+    def _taken(self, stepper: NewtonStepper | NetworkStepper, ended: list[_Ended]) -> Iterator[State]:
         def watch(potential: Potential, problem: StepProblem, pos: Tensor) -> None:
             ended.append(_ended(potential, problem, pos))
 
-        return differentiable_states(stepper, self._scene, self._start, self._num_steps, self._cloth, self._gravity, watch)
+        where = self._scene, self._start, self._num_steps, self._cloth, self._gravity
+        return differentiable_states(stepper, *where, watch, self._window, self._relaxing)
 
 
 def _ended(potential: Potential, problem: StepProblem, pos: Tensor) -> _Ended:
@@ -195,3 +259,135 @@ def _ended(potential: Potential, problem: StepProblem, pos: Tensor) -> _Ended:
 def _share(found: Tensor, better: Tensor) -> float:
     size, apart = float(better.norm()), float((found - better).norm())
     return SAFETY * apart / size + _ROUNDING if size > 0 else 0.0 if apart == 0 else float("inf")
+
+
+class Simulated(Protocol):
+    """What a :class:`hood.Simulation` says of itself."""
+
+    scene: Scene
+    stepper: Stepper
+    potential: Potential
+
+
+def followed_stepper(
+    simulation: Simulated, potential: Potential | None = None, given: Mapping[str, Any] | None = None
+) -> NewtonStepper | NetworkStepper:
+    """What takes the steps of a simulation where they are differentiated.
+
+    A refinement to an unbalanced force ends near the minimum, wherever it begins: the solver takes its steps, as far. A network
+    in fixed shapes computes in plain ones, and with tensors of float64 among those ``given`` in float64.
+
+    Raises:
+        ValueError: the steps end nowhere that is known, or an own stepper takes them.
+    """
+    stepper = simulation.stepper
+    if isinstance(stepper, RefinedStepper):
+        goal = stepper.goal
+        if not isinstance(goal, TargetResidual):
+            raise ValueError(
+                f"differentiable: steps are refined by {type(goal).__name__}, which ends them somewhere on the way to a "
+                "minimum; give hood.simulate(refine='0.01rg'), stepper='newton', or refine=0 for the network alone"
+            )
+        settings = replace(stepper.settings, target_rg=goal.target, max_iterations=goal.most)
+        solver = NewtonStepper(potential or stepper.potential, settings)
+        solver.gravity = stepper.gravity
+        return solver
+    if isinstance(stepper, NewtonStepper):
+        return stepper if potential is None else _solver_like(stepper, potential)
+    network = network_of(stepper)
+    if network is None:
+        raise ValueError(
+            f"differentiable: steps are taken by {type(stepper).__name__}, whose derivatives are not known; give "
+            "hood.simulate(stepper='newton') or stepper='network'"
+        )
+    values = (given or {}).values()
+    if any(isinstance(value, Tensor) and value.dtype == torch.float64 for value in values):
+        network = _in_double(network)
+    network.use_potential(for_networks(potential or simulation.potential))
+    return network
+
+
+def step(
+    simulation: Simulated,
+    state: State,
+    frame: int,
+    *,
+    targets: Tensor | None = None,
+    gravity: Tensor | None = None,
+    potential: Potential | None = None,
+    rest_pos: Tensor | None = None,
+    flat: Tensor | None = None,
+    **fabric: Tensor | float,
+) -> State:
+    """One step of a simulation, ``frame`` → ``frame + 1``, differentiable by all that is given: for loops of your own.
+
+    Under ``torch.no_grad`` it is a plain step. The frames of :func:`hood.differentiable` are these steps one after the other.
+
+    Args:
+        simulation: by ``stepper="newton"`` or ``"network"``, or a refinement to an unbalanced force.
+        state: at ``frame``; that of frame 0 is ``simulation.start()``.
+        frame: 0 is the first of the motion.
+        targets: (V, 3) m in the world, where held vertices are at the end; default where the simulation has them.
+        gravity, potential, rest_pos, flat, fabric: as of :func:`hood.differentiable`.
+
+    Returns:
+        The state at ``frame + 1``, relative to the same origin.
+
+    Raises:
+        ValueError: the motion has no such step, steps whose derivatives are not known, or a value that does not fit.
+
+    Examples:
+        >>> import hood, torch
+        >>> mu = torch.tensor(23600.0, dtype=torch.float64, requires_grad=True)
+        >>> simulation = hood.simulate("tank", "plie", num_frames=3, stepper="newton")
+        >>> state = simulation.start()
+        >>> for frame in range(2):
+        ...     state = hood.step(simulation, state, frame, lame_mu=mu)
+        >>> state.pos[:, 1].mean().backward()
+        >>> bool(mu.grad > 0)  # harder cloth hangs higher
+        True
+    """
+    scene, last = simulation.scene, simulation.scene.num_frames - 1
+    if not 0 <= frame < last:
+        raise ValueError(f"step: frame is {frame}; this motion has steps from the frames 0 to {last - 1}")
+    if state.pos.shape != scene.cloth.rest_pos.shape:
+        raise ValueError(
+            f"step: state.pos has the shape {tuple(state.pos.shape)}; this cloth has {scene.cloth.num_vertices} vertices, give "
+            "simulation.start() or what a step returns"
+        )
+    given = {"pos": state.pos, "vel": state.vel, "targets": targets, "gravity": gravity, "rest_pos": rest_pos, "flat": flat}
+    stepper = followed_stepper(simulation, potential, given | fabric | constants_of(potential))
+    dtype = precision_of(stepper)
+    cloth = to_device(scene.cloth, dtype=dtype)
+    if rest_pos is not None or flat is not None or fabric:
+        cloth = with_values(cloth, rest_pos, flat, **fabric)
+    scene = replace(scene, cloth=cloth)
+    state = State(state.pos.to(dtype), state.vel.to(dtype), state.origin)
+    local = None if targets is None else targets.to(dtype) - state.origin.to(dtype)
+    relaxing = stepper.relaxing is Relaxing.RESTART and frame == 0
+    return step_of_scene(stepper, scene, state, frame, gravity, local, prepare(stepper, scene), relaxing=relaxing)
+
+
+def constants_of(potential: Potential | None) -> dict[str, Any]:
+    """Constants of the terms of a potential, by names such as ``friction.coefficient``."""
+    terms = {} if potential is None else potential.terms
+    return {f"{name}.{key}": value for name, term in terms.items() for key, value in vars(term).items()}
+
+
+def _solver_like(stepper: NewtonStepper, potential: Potential) -> NewtonStepper:
+    solver = NewtonStepper(potential, stepper.settings)
+    solver.gravity = stepper.gravity
+    return solver
+
+
+def _in_double(network: NetworkStepper) -> NetworkStepper:
+    """The network with weights of float64; kept as long as it lives and its weights stay what they are."""
+    made, versions = made_of(network), [one._version for one in network.parameters()]
+    if made.get("double", (None,))[0] != versions:
+        copy = network.clone().double().eval()
+        copy.network.use_kernels("torch")
+        copy.network.use_precision("fp32")
+        copy.gravity = network.gravity.double()
+        made["double"] = versions, copy
+    found: NetworkStepper = made["double"][1]
+    return found

@@ -89,7 +89,7 @@ def ride_on(pos: np.ndarray, vertices: np.ndarray, surface: np.ndarray, faces: n
 class Held:
     """How the vertices that ``pins`` names are held: what they ride on, and springs in place of a hold."""
 
-    groups: tuple[PinGroup, ...]
+    groups: tuple[PinGroup, ...]  # what ``pins`` names; of a vertex in several the last counts
     ride: Ride | None = None  # of those that follow the skin
     stiffness: Tensor | None = None  # (V,) N/m of springs, 0 where there is none; None: all are held exactly
 

@@ -64,9 +64,9 @@ def _tell(what: str, off: Tensor, start: int, by: int, dt: float) -> None:
 class Event:
     """A row of fasteners that is opened, or closed, by the step from ``frame`` on."""
 
-    frame: int
-    name: str
-    closes: bool
+    frame: int  # the first step that it concerns begins there
+    name: str  # of the row
+    closes: bool  # False: it opens
     speed: float = SPEED  # m/s at which the two sides come together, where it closes
     by: int | None = None  # the frame in which all of it is closed, at the speed that this takes; None: at ``speed``
 
@@ -79,10 +79,10 @@ class Fastening:
     frame alone, so a rollout may begin anywhere.
     """
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the rows
     row: Tensor  # (A,) int64, the row that a pair belongs to
     pairs: Attachments  # all of them closed
-    events: tuple[Event, ...] = ()
+    events: tuple[Event, ...] = ()  # in the order of their frames
     _known: dict[Any, Attachments] = field(default_factory=dict, repr=False, compare=False)
 
     def with_events(self, events: Sequence[Event]) -> Fastening:
@@ -172,9 +172,9 @@ def first_step(seconds: float, dt: float) -> int:
 class Grasp:
     """Vertices that are held from the step of ``frame`` on, or let go by it."""
 
-    frame: int
+    frame: int  # the first step that it concerns begins there
     vertices: Tensor  # (V,) bool
-    holds: bool
+    holds: bool  # False: it lets go
     speed: float = SPEED  # m/s at which they come to where they are held
     by: int | None = None  # the frame in which all are there, at the speed that this takes; None: at ``speed``
 

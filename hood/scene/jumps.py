@@ -86,9 +86,14 @@ def carried(scene: Scene, frame: int, state: State, attachments: Attachments | N
     def along(pos: Tensor, at: np.ndarray) -> Tensor:
         """Positions relative to ``at`` as they are relative to the new origin when they have been taken along."""
         given = pos.detach().cpu().double().numpy() + (at - start)
-        return torch.as_tensor((given - middle) @ turn.T + goal + (end - origin)).to(like)
+        return torch.as_tensor((given - middle) @ turn.T + goal + (end - origin)).to(like) + turned(pos - pos.detach())
 
-    velocity = torch.as_tensor(state.vel.cpu().double().numpy() @ turn.T).to(like)
+    def turned(change: Tensor) -> Tensor:
+        """Zero, but for its derivative: what a ``change`` (V, 3) of what is taken along becomes."""
+        return change @ torch.as_tensor(turn.T).to(change) if change.requires_grad else like.new_zeros(())
+
+    velocity = torch.as_tensor(state.vel.detach().cpu().double().numpy() @ turn.T).to(like)
+    velocity = velocity + turned(state.vel - state.vel.detach())
     taken = State(along(state.pos, state.origin[0].numpy()), velocity, torch.as_tensor(origin).unsqueeze(0))
     step = scene.step_input(frame, taken, attachments=attachments, jumping=True)
     assert step.obstacle is not None  # nothing jumps without a body

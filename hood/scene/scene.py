@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hood.assets.body.body import Body
 from hood.assets.garment.garment import Garment, checked_garment
-from hood.assets.material import Material
+from hood.assets.material import NO_GRADIENT, Material
 from hood.assets.motion.sequence import PoseSequence
 from hood.cloth.cloth import Cloth, build_cloth
 from hood.cloth.state import Attachments, State, StepInput, centres_of
@@ -43,11 +43,11 @@ class NotWornError(ValueError):
 class Scene:
     """Static description of one rollout. Steps are numbered by the frame they start from."""
 
-    cloth: Cloth
-    garment: Garment
-    motion: Motion
-    dt: float
-    clearance: float = 2e-3
+    cloth: Cloth  # what is simulated
+    garment: Garment  # what it was made of
+    motion: Motion  # the body
+    dt: float  # s, of a step
+    clearance: float = 2e-3  # m, from the skin, that a garment is put on with
     start_pos: np.ndarray | None = None  # (V, 3) m, world, float64: frame 0 starts there, and is not settled
     start_vel: np.ndarray | None = None  # (V, 3) m/s, likewise
     layers: tuple[int, ...] | None = None  # garments of an outfit from the body outwards; None: as they lie at the start
@@ -273,6 +273,8 @@ def build_scene(
             raise ValueError(f"build_scene takes a hood.{kind.__name__}, such as {loaded}, not {type(given).__name__}")
     if material is not None and not isinstance(material, Material):
         raise ValueError(f"build_scene takes a hood.Material, or None for the default fabric, not {type(material).__name__}")
+    if getattr(betas, "requires_grad", False):
+        raise ValueError(f"betas: {NO_GRADIENT}")
     betas = np.zeros(10) if betas is None else np.asarray(betas, dtype=np.float64)
     return dressed_scene(garment, body_motion(body, sequence, betas, dtype, device), material, size)
 

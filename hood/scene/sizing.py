@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hood.assets.material import NO_GRADIENT
 from hood.cloth.cloth import Cloth, along_grain
 from hood.mesh import geometry
 from hood.mesh.flat import followed, rest_of
@@ -37,9 +38,9 @@ class Sizes:
         ValueError: a factor that is no size, or a time that is not positive.
     """
 
-    start: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    end: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    seconds: float = 1.0
+    start: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors along x, y and z in frame 0
+    end: tuple[float, float, float] = (1.0, 1.0, 1.0)  # from ``seconds`` on
+    seconds: float = 1.0  # that the change takes
     parts: tuple[float, ...] = ()
     to_measure: bool = True
 
@@ -52,6 +53,7 @@ class Sizes:
 
     @property
     def changing(self) -> bool:
+        """Whether start and end differ."""
         return self.start != self.end
 
     def at(self, seconds: float) -> tuple[float, float, float]:
@@ -107,6 +109,8 @@ def resized(cloth: Cloth, before: tuple[float, float, float], now: tuple[float, 
 
 
 def _three(size: GarmentSize) -> tuple[float, float, float]:
+    if any(getattr(factor, "requires_grad", False) for factor in (size if isinstance(size, (list, tuple)) else (size,))):
+        raise ValueError(f"size: {NO_GRADIENT}")
     factors = [size] * 3 if isinstance(size, (int, float)) else list(size)
     if len(factors) != 3 or not all(isinstance(f, (int, float)) and not isinstance(f, bool) for f in factors):
         raise ValueError(f"size is {size}; give one factor, such as 1.1, or three along x, y and z, such as [1,1.05,1]")

@@ -86,7 +86,7 @@ class Separation:
     pos: Tensor  # (V, 3) m
     order: tuple[int, ...]  # garments from the body outwards
     before: int  # pairs of triangles of two garments that passed through each other
-    after: int
+    after: int  # that still do
     stretch: float  # largest relative lengthening of an edge
     turned: tuple[tuple[int, int], ...] = ()  # garments over others, which lay under them against the order that was given
     seconds: float = 0.0  # of computing
@@ -96,10 +96,10 @@ class Separation:
 class Outfit(NamedTuple):
     """Garments that are one mesh."""
 
-    cloth: Cloth
+    cloth: Cloth  # of all of them
     faces: np.ndarray  # (F, 3)
     piece: np.ndarray  # (V,) garment of a vertex, from 0
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the garments
 
 
 def crossing_pairs(outfit: Outfit, pos: Tensor) -> np.ndarray:

@@ -38,10 +38,11 @@ from hood.model.parts import MULTILEVEL, OUTPUTS, SETS, SetSettings, build_featu
 from hood.model.readout.network_step import Dirichlet, Feedback, NetworkStep
 from hood.model.readout.output import Output, OutputSettings
 from hood.native import features as native
-from hood.solver.vertex.block_jacobi import check_local
+from hood.solver.vertex.block_jacobi import LocalTerms, check_local
 from hood.steppers.protocol import FrameRules, Relaxing, Stopwatch, timed
 from hood.steppers.ranges import Conditions
 from hood.tensors.batch import to_device
+from hood.tensors.dense import is_followed, unfollowed
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,11 @@ class NetworkInputs(NamedTuple):
 class NetworkStepper(nn.Module):
     """``State → State``: next_state = simulator.step(cloth, prepared, state, step_input).
 
-    Build it with :func:`build_simulator`; ``config`` holds that call's arguments and travels with the weights.
-    """
+    :func:`build_simulator` builds it; ``config`` holds that call's arguments and travels with the weights."""
 
-    gravity: Tensor
-    times: tuple[str, ...] = ("search", "features", "network", "rest", "total")
-    metrics: tuple[str, ...] = ()
+    gravity: Tensor  # (3,) m/s²
+    times: tuple[str, ...] = ("search", "features", "network", "rest", "total")  # parts of a frame's time
+    metrics: tuple[str, ...] = ()  # names of the entries of ``Prediction.metrics``
     memoryless = True
 
     def __init__(
@@ -156,6 +156,7 @@ class NetworkStepper(nn.Module):
 
     @property
     def schedule(self) -> tuple[tuple[str, ...], ...]:
+        """The sets of edges of every message-passing step."""
         return self.network.schedule
 
     @property
@@ -243,7 +244,7 @@ class NetworkStepper(nn.Module):
         with timed(watch, "network"):
             return self.advance(problem, seen, sight, *features)
 
-    @torch.no_grad()
+    @unfollowed
     def look(
         self,
         problem: StepProblem,
@@ -320,8 +321,8 @@ class NetworkStepper(nn.Module):
         return copy.to(self.gravity.device)
 
     def _residual_acceleration(self, potential: Potential, problem: StepProblem, base: Tensor) -> Tensor:
-        gradient, _ = potential.gradient(problem, base)
-        return -gradient / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
+        force = LocalTerms(potential, problem)(base).force if is_followed() else -potential.gradient(problem, base)[0]
+        return force / problem.cloth.mass.clamp_min(1e-12).unsqueeze(1) * problem.cloth.free.unsqueeze(1)
 
 
 def build_simulator(

@@ -140,8 +140,8 @@ class NewtonStepper:
     rounded to float32 leave a force of a few per cent of the weight.
     """
 
-    times: tuple[str, ...] = ("search", "solver", "rest", "total")
-    metrics: tuple[str, ...] = ("solver_iterations", "solver_converged", "solver_reason")
+    times: tuple[str, ...] = ("search", "solver", "rest", "total")  # parts of a frame's time
+    metrics: tuple[str, ...] = ("solver_iterations", "solver_converged", "solver_reason")  # of every step
     relaxing = Relaxing.SETTLE
     memoryless = True
 

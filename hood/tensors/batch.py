@@ -2,17 +2,20 @@
 
 Selection by a mask into a fixed number of rows, as captured graphs need it.
 
+Tensors with gradients inside of something, and the same thing with others in their place.
+
 A cache keyed by the identity of an object, such as a batch, which does not outlive it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import Field, field, fields
+from copy import copy
+from dataclasses import Field, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 
@@ -88,6 +91,56 @@ def to_device(item: T, device: torch.device | str | None = None, dtype: torch.dt
     known = {name: value for name, value in vars(item).items() if name not in moved and isinstance(value, (bool, int, float))}
     vars(made).update(known)
     return made
+
+
+def given_in(item: object) -> tuple[Tensor, ...]:
+    """The tensors in dataclasses, lists, dicts and modules that require a gradient, each once."""
+    found: dict[int, Tensor] = {}
+    _collect(item, found)
+    return tuple(found.values())
+
+
+def _collect(item: object, found: dict[int, Tensor]) -> None:
+    if isinstance(item, Tensor):
+        if item.requires_grad:
+            found[id(item)] = item
+    elif is_dataclass(item):
+        for spec in fields(item):
+            _collect(getattr(item, spec.name), found)
+    elif isinstance(item, dict | nn.Module):
+        for value in (item if isinstance(item, dict) else vars(item)).values():
+            _collect(value, found)
+    elif isinstance(item, list | tuple):
+        for value in item:
+            _collect(value, found)
+
+
+def swapped(item: T, table: Mapping[int, Tensor]) -> T:
+    """``item`` with its tensors replaced by those of the table, by what they are; itself where none is."""
+    if isinstance(item, Tensor):
+        return table.get(id(item), item)  # type: ignore[return-value]
+    if is_dataclass(item) and not isinstance(item, type):
+        there = {spec.name: getattr(item, spec.name) for spec in fields(item)}
+        changed = _changed(there, table)
+        return replace(item, **changed) if changed else item
+    if type(item) in (list, tuple):
+        entries = [swapped(value, table) for value in item]  # type: ignore[attr-defined]
+        return item if all(one is other for one, other in zip(entries, item, strict=True)) else type(item)(entries)  # type: ignore[call-arg, call-overload]
+    if isinstance(item, dict | nn.Module):
+        changed = _changed(item if isinstance(item, dict) else vars(item), table)
+        if changed:
+            item = copy(item)
+            (item if isinstance(item, dict) else vars(item)).update(changed)
+    return item
+
+
+def without_gradient(item: T) -> T:
+    """``item`` with its tensors detached; itself where none requires a gradient."""
+    return swapped(item, {id(one): one.detach() for one in given_in(item)})
+
+
+def _changed(there: Mapping[Any, Any], table: Mapping[int, Tensor]) -> dict[Any, Any]:
+    return {name: new for name, old in there.items() if (new := swapped(old, table)) is not old}
 
 
 class _Made(dict[str, Any]):

@@ -11,6 +11,8 @@ Other factors of time in this module are of one core of an AMD server CPU.
 How a network may compute, and the switch of torch that TensorFloat-32 needs.
 
 Where kernels in Triton run.
+
+Whether derivatives go through what a network is told.
 """
 
 from __future__ import annotations
@@ -18,18 +20,21 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 from torch.utils._python_dispatch import _disable_current_modes
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 #: Bytes of one array of a block: the few in use at a time stay in cache.
 BLOCK_BYTES = 2**20
@@ -194,6 +199,48 @@ def whole_arrays() -> Iterator[None]:
         yield
     finally:
         _whole = before
+
+
+_followed = False
+
+
+def is_followed() -> bool:
+    """Whether :func:`inputs_followed` is in force."""
+    return _followed
+
+
+@contextmanager
+def inputs_followed() -> Iterator[None]:
+    """Inside, autograd follows all that a network is told of a step (:func:`unfollowed`), by the forms for whole arrays, which
+    write to no place twice. Training needs none of that: its gradients are by weights."""
+    global _followed
+    before, _followed = _followed, True
+    try:
+        with whole_arrays(), torch.enable_grad():
+            yield
+    finally:
+        _followed = before
+
+
+def safe_root(square: Tensor) -> Tensor:
+    """√ of numbers ≥ 0; while that is :func:`inputs_followed` the derivative at 0 is 0, which else were infinite."""
+    if not _followed:
+        return square.sqrt()
+    some = square > 0
+    return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
+
+
+def unfollowed(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """What a network is told has no gradient, as under ``torch.no_grad``, but while it is :func:`inputs_followed`."""
+
+    @wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if _followed:
+            return function(*args, **kwargs)
+        with torch.no_grad():
+            return function(*args, **kwargs)
+
+    return call
 
 
 def blocks(x: Tensor) -> Iterator[slice]:

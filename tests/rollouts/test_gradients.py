@@ -86,3 +86,16 @@ def test_what_has_no_gradient_is_said(folder: Path) -> None:
     simulation = hood.simulate(str(folder / "sheet.obj"), **SHEET, settle=0, stepper="newton", num_frames=2, metrics="none")
     with pytest.raises(ValueError, match="nothing that was given requires a gradient"):
         hood.differentiable(simulation, lame_mu=2e4).gradients(loss)
+
+
+def test_steps_that_ended_at_no_minimum_are_named() -> None:
+    """Loosely solved, cloth that is pressed together ends where it has not buckled yet; its adjoint is solved all the same."""
+    keys: dict[str, Any] = {"stepper": "newton", "metrics": "none", "solver": {"target_rg": 0.3}}
+    mu = torch.tensor(23600.0, dtype=torch.float64, requires_grad=True)
+    frames = hood.differentiable(hood.simulate("tank", "walk_brisk", num_frames=13, **keys), lame_mu=mu)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message="differentiable step: the adjoint system")
+        found = frames.gradients(lambda states: states[-1].pos[:, 1].mean())
+    assert 11 in found.indefinite
+    assert min(found.indefinite) > 5

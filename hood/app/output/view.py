@@ -29,7 +29,7 @@ class Page:
 
     text: str  # HTML
     target: Path  # where save() writes it
-    num_frames: int
+    num_frames: int  # that can be played
     most: int  # vertices of the largest mesh
 
     def save(self, path: str | Path | None = None) -> Path:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hood.assets.files.library import unknown
 from hood.assets.files.text import meant, read_indices
+from hood.assets.material import NO_GRADIENT
 from hood.assets.motion.sequence import NUM_BODY_JOINTS, PoseSequence
 
 
@@ -90,7 +91,7 @@ class Body:
     Symbols: W vertices, J joints, S shape coefficients. Arrays are float64; posing is done in ``dtype``.
     """
 
-    name: str
+    name: str  # for messages and files
     v_template: np.ndarray  # (W, 3) m, T-pose, y up, z forward
     shapedirs: np.ndarray  # (W, 3, S) m per unit of beta
     joint_regressor: np.ndarray  # (J, W)
@@ -99,8 +100,14 @@ class Body:
     faces: np.ndarray  # (G, 3) int64
     family: str | None = None  # "smpl", "smplh" or "smplx": whose shape coefficients it takes; None: its own
 
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if getattr(value, "requires_grad", False):
+                raise ValueError(f"body {self.name!r}: {key}: {NO_GRADIENT}")
+
     @property
     def num_joints(self) -> int:
+        """J."""
         return len(self.parents)
 
     @property

@@ -33,7 +33,7 @@ class Garment:
     garment modelled around an A-pose keeps its lengths and angles) and ``skin_pos`` is where skinning starts from.
     """
 
-    name: str
+    name: str  # for messages and files
     rest_pos: np.ndarray  # (V, 3) m, float64
     faces: np.ndarray  # (F, 3) int64
     pinned: np.ndarray  # (V,) bool
@@ -50,9 +50,8 @@ class Garment:
     region: np.ndarray | None = None  # (V,) int64, index into hood.assets.garment.pins.MARKS; None: not marked
     stiffness: np.ndarray | None = None  # (V,) how many times as stiff as its fabric the cloth is there; None: once
     piece: np.ndarray | None = None  # (V,) int64, garment of an outfit that a vertex belongs to, from 0; None: all one garment
-    fasteners: dict[str, np.ndarray] | None = (
-        None  # (P, 2) each: pairs of vertices that a seam, buttons or a zipper hold together
-    )
+    #: (P, 2) by name: pairs of vertices that a seam, buttons or a zipper hold together.
+    fasteners: dict[str, np.ndarray] | None = None
     panels: dict[str, np.ndarray] | None = None  # (F,) bool each: faces that the mesh file gives a name, as its pattern pieces
     flat: np.ndarray | None = None  # (F, 3, 2) m, corners in the flat pattern: the cloth's lengths. NaN, None: as in rest_pos
     elastic: np.ndarray | None = None  # (F, 3) sides at rest, shares of what they are cut at (:mod:`hood.mesh.flat`)
@@ -81,6 +80,7 @@ class Garment:
 
     @property
     def bound(self) -> bool:
+        """Whether it has the weights and shape offsets that it follows a body with."""
         return self.lbs_weights is not None and self.shapedirs is not None
 
     @property

@@ -63,7 +63,7 @@ class PinGroup:
 
     vertices: np.ndarray  # (P,) int64
     weights: np.ndarray  # (P,) above 0, up to 1: held exactly
-    follows: str | tuple[int, ...] | None = None
+    follows: str | tuple[int, ...] | None = None  # what they go with
     where: str = "pins"  # how messages begin
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hood.assets.material import NO_GRADIENT
 from hood.assets.motion.recording import NUM_BODY_JOINTS
 from hood.assets.motion.skeleton import Z_UP_TO_Y_UP, from_vectors, slerp
 
@@ -29,10 +30,10 @@ class PoseSequence:
     :meth:`hood.assets.body.body.Body.translation`).
     """
 
-    name: str
+    name: str  # for messages and files
     poses: np.ndarray  # (T, 24, 3) axis-angle [rad], float64; hands zero unless asked for
     transl: np.ndarray  # (T, 3) m, float64
-    fps: float
+    fps: float  # frames per second
     betas: np.ndarray  # (S,) of the recorded subject, of the model that recorded it
     world_rotation: np.ndarray  # (3, 3)
     fingers: np.ndarray | None = None  # (T, 30, 3) axis-angle [rad]; None: flat hands
@@ -72,6 +73,7 @@ class PoseSequence:
 
     @property
     def num_frames(self) -> int:
+        """T."""
         return len(self.poses)
 
     def window(self, start: int, stop: int) -> PoseSequence:
@@ -134,7 +136,7 @@ def real_rows(
         ValueError: something else; names the first index that is not finite.
     """
     if getattr(value, "requires_grad", False):
-        raise ValueError(f"{argument}: {key} requires a gradient, and a simulation passes none back; give value.detach()")
+        raise ValueError(f"{argument}: {key}: {NO_GRADIENT}")
     try:
         array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
     except ValueError:
@@ -155,6 +157,8 @@ def rate_of(argument: str, fps: Any) -> float:
     Raises:
         ValueError: no such number.
     """
+    if getattr(fps, "requires_grad", False):
+        raise ValueError(f"{argument}: fps: {NO_GRADIENT}")
     number = isinstance(fps, (int, float, np.number)) and not isinstance(fps, bool)
     if not number or not 0.1 <= float(fps) <= 1e5:
         raise ValueError(f"{argument}: fps is {fps!r}; give frames per second, 0.1 to 100000, such as fps=30")

@@ -23,7 +23,7 @@ CLOTH_TYPE, BODY_TYPE, PINNED_TYPE = 0, 1, 3
 class NodeGroup(nn.Module):
     """Columns of the node features: (V, width) for the cloth and (W_active, width) for the body below it."""
 
-    width: int
+    width: int  # number of columns
     of = "nodes"  # whose columns these are
     normalized = True
     needs_contact = False  # reads ``inputs.contact``, or what was computed with it
@@ -33,9 +33,11 @@ class NodeGroup(nn.Module):
     needs_global_step = False  # reads ``inputs.global_step``
 
     def cloth(self, inputs: Inputs) -> Tensor:
+        """(V, width) of the vertices of the cloth."""
         raise NotImplementedError
 
     def body(self, inputs: Inputs) -> Tensor:
+        """(W_active, width) of the vertices of the body near the cloth."""
         raise NotImplementedError
 
     def forward(self, inputs: Inputs) -> Tensor:
@@ -52,7 +54,7 @@ class EdgeGroup(nn.Module):
     """Columns of the features of cloth edges (rows: ``inputs.edges``), of body edges (``inputs.body_edges``) or of those
     between layers of cloth (``inputs.layer_edges``)."""
 
-    width: int
+    width: int  # number of columns
     normalized = True
     places = False  # whether these are relative places and their lengths, which go together
     of = "edges"  # whose columns these are: of edges (of the cloth), body_edges or layer_edges

@@ -58,11 +58,11 @@ class Inputs:
         edge_rows: the table :attr:`edges` where it is known already; made or recognised from an earlier step otherwise.
     """
 
-    cloth: Cloth
-    state: State
-    step: StepInput
-    contact: Contact | None
-    graph: Graph
+    cloth: Cloth  # topology, rest shape and fabric
+    state: State  # at t
+    step: StepInput  # what is prescribed for t → t + 1
+    contact: Contact | None  # with the body, where a group or the output needs it
+    graph: Graph  # its edges, and the vertices of the body near the cloth
     base_pos: Tensor | None = None
     residual: Tensor | None = None
     local_step: Tensor | None = None
@@ -73,14 +73,17 @@ class Inputs:
 
     @property
     def num_cloth(self) -> int:
+        """V."""
         return self.graph.num_cloth
 
     @property
     def num_body(self) -> int:
+        """W_active, the number of vertices of the body near the cloth."""
         return self.graph.body_vertex.shape[0]
 
     @property
     def obstacle(self) -> Obstacle:
+        """The body, demanded."""
         if self.step.obstacle is None:
             raise ValueError("features: the graph has body nodes but the step has no obstacle; build the graph from this step")
         return self.step.obstacle
@@ -149,10 +152,12 @@ class Inputs:
 
     @property
     def body_edges(self) -> EdgeSet:
+        """Those from the body to the cloth."""
         return self.graph.edge_sets[BODY]
 
     @property
     def layer_edges(self) -> EdgeSet:
+        """Those between layers of cloth."""
         return self.graph.edge_sets[LAYERS]
 
     @cached_property

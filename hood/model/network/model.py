@@ -6,6 +6,7 @@ Which parts of a network are somebody's own: kernels that take it as a whole kno
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from typing import cast
 
@@ -30,7 +31,7 @@ from hood.model.kernels.block import check_kernels
 from hood.model.network.message_passing import EdgeDecoder, ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.tensors.dense import PRECISIONS as PRECISIONS
-from hood.tensors.dense import check_precision, pad_rows, products
+from hood.tensors.dense import check_precision, is_whole, pad_rows, products, whole_arrays
 
 #: By class what its parts are, alone or in lists and tables.
 _CLASSES: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {
@@ -88,6 +89,11 @@ _PARTS: Mapping[str, type[nn.Module]] = {
 }
 
 
+def _as_now() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
+    """What latents are computed in, and computed in again: both take arrays in the same parts."""
+    return nullcontext(), whole_arrays() if is_whole() else nullcontext()
+
+
 class MeshGraphNet(nn.Module):
     """Raw decoder output per cloth node from node and edge features.
 
@@ -118,9 +124,9 @@ class MeshGraphNet(nn.Module):
     precision. Set it by :meth:`use_precision`.
     """
 
-    precision: str
-    kernels: str
-    checkpointing: bool
+    precision: str  # of the computation, see :meth:`use_precision`
+    kernels: str  # what computes it, see :meth:`use_kernels`
+    checkpointing: bool  # whether latents are computed again backwards, which takes less memory
 
     def __init__(
         self,
@@ -274,7 +280,7 @@ class MeshGraphNet(nn.Module):
         subsets = {name: graph.subset(name, finest_level(sets)) for name in (*sets, *self.world_sets)}
         if self.checkpointing and not inferring:
             taken: tuple[Tensor, dict[str, Tensor]] = checkpoint(
-                step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False
+                step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False, context_fn=_as_now
             )
             return taken
         taken = step(nodes, edges, subsets, overwrite, self._sums) if overwrite else step(nodes, edges, subsets)

@@ -45,7 +45,7 @@ from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep
 from hood.model.readout.output import DEEPEST, VelocityBaseOutput
 from hood.native import features as native
 from hood.tensors.conjugate_gradients import Scenes, Steps, solve
-from hood.tensors.dense import sum_rows
+from hood.tensors.dense import is_followed, sum_rows
 
 #: Steps of conjugate gradients per square root of the vertices of a scene: a square sheet that hangs from one side is left with
 #: a thousandth of the energy, at every resolution. Never fewer than the second number.
@@ -110,6 +110,8 @@ def fit_edges(
     pull = weight.unsqueeze(1) * away
     pull = pull if firm is None else pull + firm.times(away)
     force = pull + system.stiffness * system.sums(vector - system.vectors(start))
+    if is_followed():
+        return start + conjugate_gradients(system, weight, force, firm)
     moved: Tensor = _Solve.apply(force, weight, *((None, None) if firm is None else firm), system)
     return start + moved
 

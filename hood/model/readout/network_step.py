@@ -7,6 +7,7 @@ A step in several passes: the network predicts, the potential says what is wrong
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -24,6 +25,7 @@ from hood.native import features as native
 from hood.solver.vertex.block_jacobi import STEPS
 from hood.solver.vertex.compiled import local_terms
 from hood.tensors.conjugate_gradients import Steps
+from hood.tensors.dense import is_followed, unfollowed
 
 _ROUNDS = torch.tensor(WIDE_ROUNDS)
 
@@ -50,11 +52,11 @@ class Feedback:
         self._cloth = cloth = problem.cloth
         self._mass = cloth.mass.clamp_min(1e-12).unsqueeze(1)
         self._compiled = native.applies(problem.state.pos, self._mass)
-        self.terms = local_terms(potential, problem, self._compiled or compiled)
+        self.terms = local_terms(potential, problem, self._compiled or (compiled and not is_followed()))
         self._together, self._steps = together, steps
         self._diffusion = None if self._compiled else Diffusion(cloth.edges, cloth.num_vertices)
 
-    @torch.no_grad()
+    @unfollowed
     def __call__(self, inputs: Inputs, pos: Tensor, held_back: Tensor | None = None) -> tuple[Inputs, Tensor]:
         """The inputs with the view from positions (V, 3), and the forces −∂Φ/∂x (V, 3) [N] there; ``held_back`` (V,) [N/m] is
         the damping of the global step."""
@@ -150,7 +152,7 @@ class Leads(Protocol):
 class CorrectionPasses:
     """The passes of one step: turns each raw output into positions and shows the next pass what they look like.
 
-    A pass starts from what the pass before led to, without a gradient: it answers for its own correction.
+    A pass starts from what the pass before led to, in training without a gradient: it answers for its own correction.
     """
 
     def __init__(self, output: Leads, step: NetworkStep) -> None:
@@ -165,7 +167,8 @@ class CorrectionPasses:
         """Positions (V, 3) [m] after the pass with this output."""
         pos = self._output.lead(raw, self._start)
         self.positions.append(pos)
-        before, last = pos.detach() - self._start.last, pos.detach()
+        last = pos if is_followed() else pos.detach()
+        before = last - self._start.last
         self._start = replace(self._start, index=len(self.positions), before=before, last=last)
         return pos
 
@@ -175,9 +178,12 @@ class CorrectionPasses:
         inputs, force = self._feedback(self._start.inputs, self._start.last)
         self._start = replace(self._start, inputs=inputs, force=force)
         self.forces.append(force)
-        with torch.no_grad():
-            see = compiled.look if compiled.applies(inputs) else look_local
-            return see(inputs, self._network.pass_sets(index + 1))
+        return _seen(inputs, self._network.pass_sets(index + 1))
+
+
+@unfollowed
+def _seen(inputs: Inputs, sets: Sequence[str]) -> tuple[Tensor, dict[str, Tensor]]:
+    return (compiled.look if compiled.applies(inputs) else look_local)(inputs, sets)
 
 
 def take_passes(output: Leads, step: NetworkStep) -> Moved:

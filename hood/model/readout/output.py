@@ -27,7 +27,7 @@ from hood.model.readout.network_step import Dirichlet, Moved, NetworkStep, Pass,
 from hood.native import features as native
 from hood.solver.vertex.block_jacobi import STEPS
 from hood.tensors.conjugate_gradients import Steps
-from hood.tensors.dense import RowSums
+from hood.tensors.dense import RowSums, is_followed
 
 _SMOOTHING_ROUNDS = 16
 #: A body this far away [m] has a quarter of the say over a vertex's base motion.
@@ -134,7 +134,7 @@ class VelocityBaseOutput(Output):
     """
 
     needs_contact = True
-    feature_sets: ClassVar[tuple[str, ...]] = ("paper", "physical")
+    feature_sets: ClassVar[tuple[str, ...]] = ("paper", "physical")  # those that tell the network enough
 
     def __init__(self, scale: float = 5e-3, clearance: float = 2e-3) -> None:
         super().__init__()
@@ -142,9 +142,11 @@ class VelocityBaseOutput(Output):
 
     @classmethod
     def from_settings(cls, settings: OutputSettings, options: Mapping[str, Any]) -> Self:
+        """The output of a model with these settings; ``options`` are arguments of the class."""
         return cls(settings.scale, **options)
 
     def base(self, problem: StepProblem) -> Tensor:
+        """Base positions (V, 3) [m]: what zero output means."""
         state, contact, cloth = problem.state, problem.contact, problem.cloth
         if contact is None:
             return inertial_guess(state, problem.step, cloth.vertex_scene)
@@ -172,6 +174,7 @@ class VelocityBaseOutput(Output):
         return base
 
     def displacement(self, raw: Tensor) -> Tensor:
+        """Displacement (V, 3) [m] from the base for raw output (V, 3)."""
         return self.scale * raw
 
     def outside(self, problem: StepProblem, pos: Tensor) -> Tensor:
@@ -310,7 +313,7 @@ class GlobalStepOutput(VelocityBaseOutput):
         push = force + _PUSH * mass.unsqueeze(1) * raw[:, :3]
         inertia = mass / problem.vertex_dt.squeeze(1) ** 2
         damping = _DAMPING * inertia * torch.exp((2.0 * raw[:, 3]).clamp(-_RANGE, _RANGE))
-        moved: Tensor = _Solve.apply(push, damping, last, solver)
+        moved: Tensor = solver.solve(last, push, damping) if is_followed() else _Solve.apply(push, damping, last, solver)
         moved = moved * (_LONGEST / moved.norm(dim=1, keepdim=True).clamp_min(_LONGEST))
         return torch.where(held.free.unsqueeze(1), self.outside(problem, last + moved), held.fixed)
 

@@ -32,10 +32,10 @@ _NOT_OF_MESH = ("seed", "name", "sequence", "material", "body")
 
 
 class ClothMesh(NamedTuple):
-    """The mesh of a rollout's cloth: ``faces`` (F, 3) int64 and ``rest_pos`` (V, 3) m."""
+    """The mesh of a rollout's cloth."""
 
-    faces: Tensor
-    rest_pos: Tensor
+    faces: Tensor  # (F, 3) int64
+    rest_pos: Tensor  # (V, 3) m
 
 
 @dataclass(frozen=True)

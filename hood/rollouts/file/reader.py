@@ -52,8 +52,8 @@ class RolloutData:
     body_pos: np.ndarray  # (T, W, 3) m, world
     body_faces: np.ndarray  # (G, 3)
     time: np.ndarray  # (T,) s
-    metrics: dict[str, np.ndarray]
-    attributes: dict[str, Any]
+    metrics: dict[str, np.ndarray]  # (T,) by name, such as strain_p99; NaN where not measured
+    attributes: dict[str, Any]  # of the file: garment, material, solver settings, num_planned, complete, …
     fields: dict[str, np.ndarray] = field(default_factory=dict)  # (T, V) by name, such as rg
     alarms: list[dict[str, Any]] = field(default_factory=list)  # of a guard, with the names of ALARM_COLUMNS
     still: dict[str, np.ndarray] = field(default_factory=dict)  # of the cloth, by the names of STILL

@@ -83,7 +83,7 @@ _METRICS, _FINITE, _VERTICES, _POS = "steps/metrics", "steps/finite", "steps/ver
 class Steps:
     """Simulated frames 0, 1, … of a rollout that stores frames at a rate of its own."""
 
-    rate: OutputRate
+    rate: OutputRate  # of the stored frames
     finite: np.ndarray  # (S,) bool, whether all positions are
     metrics: dict[str, np.ndarray]  # (S,) by name
     vertices: np.ndarray  # (K,) those whose positions are kept: what events fasten and hold

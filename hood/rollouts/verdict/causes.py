@@ -53,9 +53,15 @@ def guard_doubts(data: RolloutData) -> FoundFrames:
         worst = max(rows, key=lambda row: row["value"])
         what = text.format(value=worst["value"], limit=worst["limit"])
         where = name_frames(mask_of(frames))
-        sentence = f"the guard saw {what}, in {where}, and did not mend it; guard=repair, refine=5 or stepper=newton"
+        sentence = f"the guard saw {what}, in {where}, and did not mend it; {_way_out(data)}"
         doubts.append(Doubt("guard", sentence, tuple(frames), float(worst["value"])))
     return FoundFrames(doubts=doubts)
+
+
+def _way_out(data: RolloutData) -> str:
+    if data.attributes.get("stepper") == "newton":
+        return "these are the solver's own steps: look at fabric, size, forces and motion"
+    return "guard=repair, refine=5 or stepper=newton"
 
 
 #: The metric of :mod:`hood.rollouts.verdict.distance`.

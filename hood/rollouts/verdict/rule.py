@@ -35,12 +35,12 @@ class Reason:
     """Why a rollout is unsound."""
 
     kind: str  # a stable word, see :data:`hood.rollouts.verdict.frames.KINDS`
-    sentence: str
+    sentence: str  # the same in words, with the worst value
     frames: tuple[tuple[int, int], ...] = ()  # runs of bad frames, first and last
     value: float | None = None  # the worst
     frame: int | None = None  # where that is
-    limit: float | None = None
-    unit: str = ""
+    limit: float | None = None  # that the value is compared with
+    unit: str = ""  # of both
     part: int | None = None  # of the garment, from 1
 
     def as_dict(self) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class Reason:
 class Verdict:
     """Sound, unsound, or, with None, not known."""
 
-    sound: bool | None
+    sound: bool | None  # None: too little was measured
     reasons: tuple[Reason, ...] = ()  # why unsound, or what is missing
     doubts: tuple[dict[str, Any], ...] = ()  # :meth:`hood.assets.files.said.Doubt.as_dict`
     notes: tuple[str, ...] = ()  # what was seen and does not count, and why

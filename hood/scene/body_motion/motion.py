@@ -35,16 +35,24 @@ class Motion(Protocol):
         ...
 
     @property
-    def num_frames(self) -> int: ...
+    def num_frames(self) -> int:
+        """T."""
+        ...
 
     @property
-    def fps(self) -> float: ...
+    def fps(self) -> float:
+        """Frames per second."""
+        ...
 
     @property
-    def dtype(self) -> torch.dtype: ...
+    def dtype(self) -> torch.dtype:
+        """Of the positions that it gives."""
+        ...
 
     @property
-    def device(self) -> torch.device: ...
+    def device(self) -> torch.device:
+        """Where these are."""
+        ...
 
     @property
     def translation(self) -> np.ndarray:
@@ -61,7 +69,9 @@ class Motion(Protocol):
         ...
 
     @property
-    def num_vertices(self) -> int: ...
+    def num_vertices(self) -> int:
+        """W; 0 where there is no body."""
+        ...
 
     def surface(self, frame: int, origin: np.ndarray) -> Tensor:
         """(W, 3) m."""

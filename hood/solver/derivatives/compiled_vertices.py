@@ -60,10 +60,12 @@ def wall_structures(walls: tuple[Walls, ...]) -> tuple[ctypes.Array[WallStructur
     structures, kept = (WallStructure * len(walls))(), list[Tensor]()
     for structure, wall in zip(structures, walls, strict=True):
         kept += _pointed(structure, wall, ("point", "normal", "reach"))
-        structure.weight = 1.0 if isinstance(wall.weight, Tensor) else wall.weight
-        if isinstance(wall.weight, Tensor):
+        if isinstance(wall.weight, Tensor) and wall.weight.ndim:
+            structure.weight = 1.0
             kept.append(whole(wall.weight))
             structure.share = kept[-1].data_ptr()
+        else:
+            structure.weight = float(wall.weight)
     return structures, kept
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from hood.cloth.cloth import Cloth
 from hood.energies.bending import HingeForm, bending_weight
 from hood.energies.membrane import isotropic_density, isotropic_stress, weave_density, weave_roots, weave_stress
-from hood.tensors.dense import at_once, index_of
+from hood.tensors.dense import at_once, index_of, safe_root
 
 #: As in hood.mesh.geometry: a triangle is degenerate when a sine in it is below this many units of rounding.
 _DEGENERATE_ULPS = 8.0
@@ -225,7 +225,7 @@ def outer_upper(row: Tensor, out: Tensor, add: bool = False) -> None:
 def _positive_part(s00: Tensor, s01: Tensor, s11: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The symmetric 2 × 2 matrix with its negative eigenvalues replaced by 0."""
     mean, half = 0.5 * (s00 + s11), 0.5 * (s00 - s11)
-    radius = torch.addcmul(half * half, s01, s01).sqrt()  # hypot is many times slower
+    radius = safe_root(torch.addcmul(half * half, s01, s01))  # hypot is many times slower
     high, low = (mean + radius).clamp_min(0.0), (mean - radius).clamp_min(0.0)
     centre = 0.5 * (high + low)
     slope = torch.where(radius > 0, 0.5 * (high - low) / torch.where(radius > 0, radius, 1.0), 0.0)

@@ -31,7 +31,7 @@ from hood.solver.derivatives import elements
 from hood.solver.derivatives.elements import Corners
 from hood.solver.derivatives.vertices import VertexForces, VertexModel, terms_without_form, vertex_forces
 from hood.solver.system.sparsity import BlockPattern
-from hood.tensors.dense import add_rows
+from hood.tensors.dense import add_rows, is_followed
 
 
 class StepTerms:
@@ -106,7 +106,10 @@ class StepTerms:
 
     def other_gradient(self, pos: Tensor, acc: Tensor) -> Tensor | None:
         """Gradient (V, 3) [N] of the energies that have no closed form here, by autograd; None without any."""
-        return None if self.others is None else self.others.gradient(self.problem, pos, acc)[0]
+        if self.others is None or not is_followed():
+            return None if self.others is None else self.others.gradient(self.problem, pos, acc)[0]
+        at = pos if pos.requires_grad else pos.detach().requires_grad_()
+        return torch.autograd.grad(self.others.total(self.problem, at).sum(), at, create_graph=True)[0]
 
 
 def stretch_rate(potential: Potential, problem: StepProblem) -> Tensor | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from hood.energies.wind import Drag
 from hood.solver.derivatives import compiled_vertices
 from hood.solver.derivatives.compiled_vertices import ContactPass, VertexPass, contact_pass
 from hood.tensors.batch import forget
+from hood.tensors.dense import safe_root
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = F
 def _slope(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Slip (N, 3) [m], its size (N,) and the force along it in units of it (N,) [N/m]."""
     slip = grip.slip(pos)
-    size = dot_rows(slip, slip).sqrt()
+    size = safe_root(dot_rows(slip, slip))
     return slip, size, grip.force * slip_slope(size, grip.limit)
 
 
@@ -230,6 +231,30 @@ def split(potential: Potential) -> tuple[Potential, Potential]:
         if getattr(term, "contact", "vertices") == "vertices"
     }
     return potential.only(single), potential.only({n: term for n, term in potential.terms.items() if n not in single})
+
+
+def force_of(potential: Potential, problem: StepProblem, pos: Tensor) -> Tensor:
+    """∂Φ/∂x [N] (V, 3) at ``pos`` (V, 3), as a function that autograd follows."""
+    at = pos if pos.requires_grad else pos.detach().requires_grad_()
+    single, rest = split(potential)
+    total = torch.zeros_like(pos)
+    if single.terms:
+        total = _on_vertices(vertex_forces(single, problem), at, problem.acceleration(at))
+    if rest.active(problem):
+        (slope,) = torch.autograd.grad(rest.total(problem, at).sum(), at, create_graph=True)
+        total = total + slope
+    return total
+
+
+def _on_vertices(forces: VertexForces, pos: Tensor, acc: Tensor) -> Tensor:
+    total = replace(forces, grips=()).gradient(pos, acc)
+    for grip in forces.grips:
+        slip = grip.slip(pos)
+        square = dot_rows(slip, slip)
+        slips = square > 0  # the root has no slope at 0
+        size = torch.where(slips, torch.where(slips, square, 1.0).sqrt(), 0.0)
+        total = total + (grip.force * slip_slope(size, grip.limit)).unsqueeze(1) * slip
+    return total
 
 
 def _single(

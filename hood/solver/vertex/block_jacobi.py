@@ -24,7 +24,7 @@ from hood.solver.derivatives.step_terms import StepTerms
 from hood.solver.system.linear import invert_blocks
 from hood.tensors.batch import made_of
 from hood.tensors.conjugate_gradients import Scenes, Steps, solve
-from hood.tensors.dense import add_rows
+from hood.tensors.dense import add_rows, unfollowed
 
 #: Half as many as there are vertices along a square sheet: from its middle to its rim.
 STEPS = Steps(0.5, 8)
@@ -50,7 +50,7 @@ class LocalTerms:
         self.terms = StepTerms(potential, problem)
         self._incidence = incidence_of(problem.cloth)
 
-    @torch.no_grad()
+    @unfollowed
     def __call__(self, pos: Tensor) -> LocalView:
         """The view at positions (V, 3)."""
         terms, cloth = self.terms, self.problem.cloth
@@ -83,7 +83,7 @@ class LocalTerms:
         self._looked_at = pos, whole, matrix
         return LocalView(force, torch.where(cloth.free.unsqueeze(1), step, 0.0))
 
-    @torch.no_grad()
+    @unfollowed
     def solve(self, pos: Tensor, force: Tensor, damping: Tensor, steps: Steps = STEPS) -> Tensor:
         """The global step (V, 3) [m] under forces (V, 3) [N]: u with (A + diag(``damping``)) u = ``force`` where vertices are
         free, 0 elsewhere, as nearly as ``steps`` of conjugate gradients come. A is the positive matrix at positions (V, 3),

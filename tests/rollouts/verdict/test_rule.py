@@ -186,6 +186,10 @@ def test_what_the_guard_saw_and_did_not_mend_is_doubtful() -> None:
     (doubt,) = judge_rollout(stored(30, {"strain_p99": frames(30)}, alarms=rows)).doubts
     assert (doubt["kind"], doubt["frames"], doubt["value"]) == ("guard", [10, 11], 0.3)
     assert "strain p99 beyond 25%, 30% at worst, in frames 10–11, and did not mend it" in doubt["sentence"]
+    assert doubt["sentence"].endswith("guard=repair, refine=5 or stepper=newton")
+    solved = stored(30, {"strain_p99": frames(30)}, alarms=rows)
+    solved.attributes["stepper"] = "newton"
+    assert "stepper=newton" not in judge_rollout(solved).doubts[0]["sentence"]
     mended = [alarm(frame, "strain", REFINED) for frame in (10, 11)]
     assert judge_rollout(stored(30, {"strain_p99": frames(30)}, alarms=mended)).doubts == ()
     assert judge_rollout(stored(300, {"strain_p99": frames(300)}, alarms=rows)).doubts == ()
