@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hood.cloth.cloth import Cloth, with_values
 from hood.cloth.state import State
@@ -369,9 +369,24 @@ def step(
 
 
 def constants_of(potential: Potential | None) -> dict[str, Any]:
-    """Constants of the terms of a potential, by names such as ``friction.coefficient``."""
+    """Constants of the terms of a potential, by names such as ``friction.coefficient``, or of what is in lists, dicts, modules
+    of terms of one's own, ``stiffening.layers.0.weight``."""
     terms = {} if potential is None else potential.terms
-    return {f"{name}.{key}": value for name, term in terms.items() for key, value in vars(term).items()}
+    parts = {key: term if isinstance(term, nn.Module) else vars(term) for key, term in terms.items()}
+    return dict(_named("", parts))
+
+
+def _named(name: str, item: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(item, nn.Module):
+        own = {key: value for key, value in vars(item).items() if not key.startswith("_")}
+        item = {**dict(item.named_parameters()), **dict(item.named_buffers()), **own}
+    if isinstance(item, list | tuple):
+        item = dict(enumerate(item))
+    if not isinstance(item, dict):
+        yield name, item
+        return
+    for key, value in item.items():
+        yield from _named(f"{name}.{key}" if name else str(key), value)
 
 
 def _solver_like(stepper: NewtonStepper, potential: Potential) -> NewtonStepper:

@@ -27,6 +27,7 @@ from hood.mesh.shapes import grid, sphere
 from hood.rollouts import adjoint
 from hood.rollouts.adjoint import Hessian
 from hood.rollouts.differentiable import differentiable_step, indefinite_at
+from hood.rollouts.gradients import constants_of
 from hood.solver.newton import NewtonSettings
 from hood.steppers.newton import NewtonStepper
 
@@ -210,6 +211,13 @@ def test_an_own_energy_may_have_tensors_in_lists_and_modules() -> None:
             ends.append(float(loss((potential, problem)).detach()))
         tensor.data += change * way
         assert float((by * way).sum()) == pytest.approx((ends[0] - ends[1]) / (2.0 * change), rel=1e-5)
+
+
+def test_tensors_of_own_energies_have_names() -> None:
+    found = constants_of(default_potential().with_terms(own=Learned()))
+    tensors = {name for name, value in found.items() if isinstance(value, Tensor)}
+    assert tensors == {"own.layer.weight", "own.layer.bias", "own.listed.0", "own.named.size.0"}
+    assert found["friction.coefficient"] == 0.5
 
 
 def test_what_would_be_dropped_is_refused() -> None:
