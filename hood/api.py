@@ -38,11 +38,10 @@ from hood.energies.potential import Potential
 from hood.rollouts import loop as frames
 from hood.rollouts.differentiable import precision_of
 from hood.rollouts.frame import Frame
-from hood.rollouts.gradients import DifferentiableFrames, constants_of, followed_stepper
+from hood.rollouts.gradients import DifferentiableFrames, constants_of, followed_stepper, restarts
 from hood.scene.scene import Scene
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import Stepper, require_stepper
-from hood.steppers.protocol import Relaxing
 from hood.tensors.batch import to_device
 
 
@@ -79,8 +78,13 @@ class Simulation:
         return self.num_frames
 
     def start(self) -> State:
-        """The state of frame 0, on the body, where :func:`hood.step` may begin."""
+        """The state of frame 0, on the body, where :func:`hood.step` may begin. It is found anew, which takes a few steps."""
         return next(iter(self)).state
+
+    @property
+    def relaxes(self) -> bool:
+        """Whether a network that restarts from a relaxing step begins with one."""
+        return start_of(self._ready.config)[1] > 0
 
     def __iter__(self) -> Iterator[Frame]:
         config = self._ready.config
@@ -225,15 +229,15 @@ def differentiable(
         >>> bool(mu.grad > 0)  # harder cloth hangs higher
         True
     """
-    count = simulation.num_frames if num_frames is None else min(num_frames, simulation.num_frames)
-    given = {"gravity": gravity, "rest_pos": rest_pos, "flat": flat, **fabric}
-    given |= constants_of(potential or simulation.potential)
+    most, shown = simulation._simulated, potential or simulation.potential
+    given = {"gravity": gravity, "rest_pos": rest_pos, "flat": flat, **fabric, **constants_of(shown)}
     given |= {} if start is None else {"start.pos": start.pos, "start.vel": start.vel}
     stepper = followed_stepper(simulation, potential, given)
     cloth = with_values(to_device(simulation.scene.cloth, dtype=precision_of(stepper)), rest_pos, flat, **fabric)
     tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
-    state, relaxing = simulation.start() if start is None else start, stepper.relaxing is Relaxing.RESTART
-    return DifferentiableFrames(stepper, simulation.scene, state, count - 1, cloth, gravity, tensors, window, relaxing)
+    state, steps = start or simulation.start(), (most if num_frames is None else min(num_frames, most)) - 1
+    how = window, restarts(simulation, stepper), shown
+    return DifferentiableFrames(stepper, simulation.scene, state, steps, cloth, gravity, tensors, *how)
 
 
 def _own(garment: Any, body: Any, sequence: Any, material: Any) -> tuple[Own, dict[str, Any]]:

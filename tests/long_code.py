@@ -109,4 +109,5 @@ FUNCTIONS = {
     "hood.model.kernels.triton_kernels.edges_pass": "a Triton kernel is one function",
     "hood.api.simulate": "its docstring: arguments, errors, an example",
     "hood.assets.motion.load.load_sequence": "its docstring: arguments, errors, an example",
+    "hood.rollouts.gradients.step": "its docstring: arguments, errors, an example",
 }

@@ -123,9 +123,7 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
     settings = RolloutSettings.from_words([*_USUAL, *given])
     unknowns = _unknowns(config, settings, names)
     if frames is None and config.observed is None:
-        raise ConfigError(
-            "observed: nothing was observed; give a rollout.h5 or a folder: hood fit observed=scans garment=dress"
-        )
+        raise ConfigError("observed: nothing was observed; give rollout.h5 or a folder: hood fit observed=scans garment=dress")
     seen, loss = str(config.observed) if frames is None else frames, (bool(config.whole), float(config.huber or math.inf))
     observed = observed_frames(seen, bool(config.points), int(config.most_points), *loss)
     if "num_frames" in {word.partition("=")[0] for word in given}:
@@ -138,6 +136,8 @@ def run_fit(words: Sequence[str], frames: Any = None) -> Fitted:
     measured = bool(config.from_first) if config.from_first is not None else bool({*names} & {*_SEVERAL["fabric"]})
     scene = _Scene(settings, observed, int(config.first), int(config.every), measured)
     scene.check({one.name: one.guess for one in unknowns})
+    if config.from_first and not scene.from_first:
+        raise ConfigError("from_first=true: is for worn cloth of which all vertices were seen in frame 0; leave it out")
     folder = prepare_folder(output_folder(config))
     with occupy(folder):
         return _Fit(config, scene, unknowns, given, folder).run()

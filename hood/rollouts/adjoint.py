@@ -404,6 +404,8 @@ def solve_symmetric(apply: Callable[[Tensor], Tensor], precondition: Callable[[T
             column[k + 1, k] = length = float(q.norm())
             basis[k + 1] = q / length if length > 0 else q
             known = column[: k + 2, : k + 1]
+            if not np.isfinite(known).all():
+                return Solution(torch.full_like(rhs, torch.nan), False, indefinite)
             y = np.linalg.lstsq(known, start[: k + 2])[0]
             missing = start[: k + 2] - known @ y
             if not np.linalg.norm(missing) > limit or not length > 0:
@@ -413,7 +415,7 @@ def solve_symmetric(apply: Callable[[Tensor], Tensor], precondition: Callable[[T
         curvature = (ways[: k + 1] @ basis[: k + 2].t()).cpu().numpy() @ known
         least, *_, most = np.linalg.eigvalsh(curvature + curvature.T)[[0, -1]]
         indefinite |= bool(least < -_ROUNDING * abs(most))
-    return Solution(x.view_as(rhs), not bool(r.norm() > 1e2 * limit), indefinite)
+    return Solution(x.view_as(rhs), bool(r.norm() <= 1e2 * limit), indefinite)
 
 
 def _compiled(potential: Potential, problem: StepProblem, plan: SolverPlan, pos: Tensor) -> CompiledSystem | None:

@@ -19,8 +19,8 @@ in the step; where they are, and the lagged forces of friction, are not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from copy import copy
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -128,6 +128,7 @@ def differentiable_states(
     watch: Watch | None = None,
     window: int | None = None,
     relaxing: bool = False,
+    potential: Potential | None = None,
 ) -> Iterator[State]:
     """States of the frames after ``state``, which is that of frame 0, each differentiable by all that came before; see
     :func:`differentiable_step`. The origin of their frame stays where that of ``state`` is.
@@ -139,6 +140,7 @@ def differentiable_states(
         watch: is shown every step of a solver when it has been taken.
         window: the state at every so many frames is a constant to the frames after it; None: at none.
         relaxing: whether the first step is the relaxing one of a network that restarts from it.
+        potential: that a network looks at; None: the one that it looks at when a step is taken.
 
     Raises:
         ValueError: the size of a flat pattern changes, and its rest shape is differentiated.
@@ -150,8 +152,8 @@ def differentiable_states(
     for frame in range(num_steps):
         if window is not None and frame and frame % window == 0:
             state = State(state.pos.detach(), state.vel.detach(), state.origin)
-        state = recentre(state, scene.cloth.vertex_scene) if dtype == torch.float32 else state
-        state = step_of_scene(stepper, scene, state, frame, gravity, None, prepared, watch, relaxing and frame == 0)
+        first = relaxing and frame == 0
+        state = step_of_scene(stepper, scene, state, frame, gravity, None, prepared, watch, first, potential)
         yield in_frame_of(origin, state)
 
 
@@ -165,6 +167,7 @@ def step_of_scene(
     prepared: Any = None,
     watch: Watch | None = None,
     relaxing: bool = False,
+    potential: Potential | None = None,
 ) -> State:
     """The step ``frame`` → ``frame + 1`` of a scene whose cloth may be differentiated, with what happens to the cloth in it:
     what is held and let go, sizes that change, fasteners, and a body that jumps, with which the state is carried along.
@@ -172,8 +175,10 @@ def step_of_scene(
     Args:
         targets: (V, 3) m in the frame of ``state``, where held vertices go; default where the scene has them.
         prepared: what :func:`prepare` gives.
+        potential: that a network looks at in this step alone; None: the one that it looks at anyway.
     """
-    cloth, dtype = scene.cloth, precision_of(stepper)
+    cloth, dtype, origin = scene.cloth, precision_of(stepper), state.origin
+    state = recentre(state, cloth.vertex_scene) if dtype == torch.float32 else state
     if scene.sizes.changing and cloth.flat is not None and (cloth.flat.requires_grad or cloth.rest_pos.requires_grad):
         raise ValueError(
             "differentiable: the size changes in this rollout, which has no derivative by the rest shape of a flat pattern; "
@@ -189,12 +194,14 @@ def step_of_scene(
     if targets is not None:
         if step.pin_target is None:
             raise ValueError("step: targets are given, but no vertex is held in this step; give pins=… to hood.simulate")
-        step = replace(step, pin_target=targets + (state.origin - there.origin).to(targets))
+        step = replace(step, pin_target=targets + (origin - there.origin).to(targets))
     step = StepInput(*(_in(getattr(step, spec.name), dtype) for spec in fields(step)))
     gravity = (stepper.gravity if gravity is None else gravity).to(dtype)
     problem = StepProblem(scene.cloth_of_step(frame, 0), there, step, gravity=gravity)
-    taken = differentiable_step(stepper, problem, watch, prepared)
-    return in_frame_of(state.origin, taken)
+    shown = _looking_at(stepper, potential) if isinstance(stepper, NetworkStepper) and potential is not None else nullcontext()
+    with shown:
+        taken = differentiable_step(stepper, problem, watch, prepared)
+    return in_frame_of(origin, taken)
 
 
 def in_frame_of(origin: Tensor, state: State) -> State:
@@ -234,12 +241,27 @@ def _in(item: Any, dtype: torch.dtype) -> Any:
     return to_device(item, dtype=dtype)
 
 
+class Unchanged:
+    """Tensors of which the derivatives are taken later, where they must be what they were."""
+
+    def __init__(self, given: Iterable[Tensor]) -> None:
+        self._given = [(one, one._version) for one in given]
+
+    def check(self) -> None:
+        """Raise RuntimeError where one was changed in place."""
+        if any(one._version != version for one, version in self._given):
+            raise RuntimeError(
+                "differentiable: a tensor was changed in place since the step was taken; ask for gradients before "
+                "optimizer.step(), and take the steps again after it"
+            )
+
+
 class _Predicted:
     """A step that a network has taken, and its derivatives: the network's own, of the same step taken again in torch."""
 
     def __init__(self, stepper: NetworkStepper, problem: StepProblem, prepared: Any, given: tuple[Tensor, ...]) -> None:
         self._stepper, self._problem, self._prepared = stepper, problem, prepared
-        self._ids, self._potential = [id(one) for one in given], stepper.potential
+        self._ids, self._potential, self._unchanged = [id(one) for one in given], stepper.potential, Unchanged(given)
         plain = {key: tensor.detach() for key, tensor in zip(self._ids, given, strict=True)}
         fixed = replace(swapped(problem, plain), cloth=_detached(problem.cloth, plain))
         with torch.no_grad(), _looking_at(stepper, _with_tensors(self._potential, plain, number=True)):
@@ -249,6 +271,7 @@ class _Predicted:
 
     def pull_back(self, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives of a loss by what was given, of those by positions and velocities (V, 3) at the end."""
+        self._unchanged.check()
         leaves = [tensor.detach().requires_grad_() for tensor in _given(self._problem, self._potential)]
         table = dict(zip(self._ids, leaves, strict=True))
         potential, problem = _with_tensors(self._potential, table), swapped(self._problem, table)
@@ -295,7 +318,7 @@ class _Solved:
     indefinite = False
 
     def __init__(self, stepper: NewtonStepper, problem: StepProblem, given: tuple[Tensor, ...]) -> None:
-        self.problem, self.potential, self._given = problem, stepper.potential, given
+        self.problem, self.potential, self._given, self._unchanged = problem, stepper.potential, given, Unchanged(given)
         check_given(problem, stepper.potential)
         plain = {id(tensor): tensor.detach() for tensor in given}
         self._plain = _with_tensors(stepper.potential, plain, number=True)
@@ -325,6 +348,7 @@ class _Solved:
     @torch.enable_grad()
     def pull_back(self, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives of a loss by what was given, of that ``grad`` (V, 3) by the positions."""
+        self._unchanged.check()
         leaves = [tensor.detach().requires_grad_() for tensor in self._given]
         table = {id(tensor): leaf for tensor, leaf in zip(self._given, leaves, strict=True)}
         potential = _with_tensors(without_layers(self.potential) if self._apart else self.potential, table)
@@ -394,12 +418,12 @@ def _given(problem: StepProblem, potential: Potential) -> tuple[Tensor, ...]:
 
 
 def _with_tensors(potential: Potential, table: Mapping[int, Tensor], number: bool = False) -> Potential:
-    """The potential with constants of its terms replaced by those of the table; where asked, numbers are in place of tensors of
-    one: compiled parts take those."""
+    """The potential with constants of its terms replaced by those of the table; where asked, terms that have a compiled form
+    get numbers in place of tensors of one."""
     terms = dict(potential.terms)
     for name, term in terms.items():
         new = {key: swapped(value, table) for key, value in vars(term).items()}
-        if number:
+        if number and (type(term).__module__.startswith("hood.") or getattr(term, "form", None) is not None):
             new |= {key: float(value) for key, value in new.items() if isinstance(value, Tensor) and value.ndim == 0}
         if any(new[key] is not value for key, value in vars(term).items()):
             terms[name] = copy(term)

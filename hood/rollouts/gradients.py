@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from hood.cloth.cloth import Cloth, with_values
 from hood.cloth.state import State
 from hood.energies.self_contact import for_networks
-from hood.rollouts.differentiable import differentiable_states, indefinite_at, precision_of, prepare, step_of_scene
+from hood.rollouts.differentiable import Unchanged, differentiable_states, indefinite_at, precision_of, prepare, step_of_scene
 from hood.solver.step_figures import StepFigures
 from hood.steppers.network import NetworkStepper
 from hood.steppers.newton import NewtonStepper, Stepper
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from hood.energies.potential import Potential
     from hood.energies.problem import StepProblem
     from hood.scene.scene import Scene
+    from hood.solver.newton import NewtonSettings
 
 #: The second rollout goes to this share of the unbalanced force that the first one reached, and no further than the next.
 _FURTHER, _FURTHEST = 1e-2, 1e-11
@@ -117,6 +118,8 @@ class DifferentiableFrames(Iterator[State]):
         given: tensors that gradients are taken by, by name; those that require none are left out.
         window: gradients go back through at most so many steps: the state at every so many frames is a constant to the frames
             after it. None: through all.
+        relaxing: whether the first step is the relaxing one of a network that restarts from it.
+        potential: of which a network is shown what it may look at.
 
     Raises:
         ValueError: ``window`` is less than 1.
@@ -133,14 +136,15 @@ class DifferentiableFrames(Iterator[State]):
         given: Mapping[str, Tensor],
         window: int | None = None,
         relaxing: bool = False,
+        potential: Potential | None = None,
     ) -> None:
         if window is not None and window < 1:
             raise ValueError(f"differentiable: window is {window}; give at least 1 step, or None for all")
-        self._window, self._relaxing = window, relaxing
+        self._window, self._relaxing, self._potential = window, relaxing, potential
         self._stepper, self._scene, self._start, self._num_steps = stepper, scene, start, num_steps
         self._cloth, self._gravity = cloth, gravity
         self._given = {name: value for name, value in given.items() if value.requires_grad}
-        self._states, self._begun = self._taken(stepper, []), False
+        self._states, self._begun, self._unchanged = self._taken(stepper, []), False, Unchanged(self._given.values())
 
     def __next__(self) -> State:
         state = next(self._states)
@@ -153,9 +157,10 @@ class DifferentiableFrames(Iterator[State]):
         """Warn of what a network is not told of: gradients by that are zero."""
         if not isinstance(self._stepper, NetworkStepper) or not self._given or not torch.is_grad_enabled():
             return
-        ends = first.pos.sum() + first.vel.sum()
-        found = torch.autograd.grad(ends, list(self._given.values()), retain_graph=True, allow_unused=True)
-        unseen = [name for name, grad in zip(self._given, found, strict=True) if grad is None]
+        ends, unseen = first.pos.sum() + first.vel.sum(), list(self._given)
+        if ends.requires_grad:
+            found = torch.autograd.grad(ends, list(self._given.values()), retain_graph=True, allow_unused=True)
+            unseen = [name for name, grad in zip(self._given, found, strict=True) if grad is None]
         if unseen:
             warnings.warn(
                 f"differentiable: the network is not told of {', '.join(unseen)}: gradients by that are zero; give "
@@ -182,6 +187,7 @@ class DifferentiableFrames(Iterator[State]):
         """
         if not self._given:
             raise ValueError("gradients: nothing that was given requires a gradient; give tensors with requires_grad=True")
+        self._unchanged.check()
         if isinstance(self._stepper, NetworkStepper):
             value, found = self._followed(loss, self._stepper, [])
             return Gradients(float(value), found, {}, ())
@@ -191,7 +197,7 @@ class DifferentiableFrames(Iterator[State]):
         reached = max((step.rg for step in near), default=0.0)
         target = max(_FURTHER * reached, _FURTHEST)
         settings = replace(self._stepper.settings, target_rg=target, max_iterations=500, budget_ms=None)
-        _, better = self._followed(loss, NewtonStepper(self._stepper.potential, settings), far)
+        _, better = self._followed(loss, _solver(self._stepper.potential, settings, self._stepper.gravity), far)
         error = {name: _share(found[name], better[name]) for name in found}
         steps = tuple(
             FollowedStep(
@@ -234,7 +240,8 @@ class DifferentiableFrames(Iterator[State]):
             ended.append(_ended(potential, problem, pos))
 
         where = self._scene, self._start, self._num_steps, self._cloth, self._gravity
-        return differentiable_states(stepper, *where, watch, self._window, self._relaxing)
+        shown = None if self._potential is None else for_networks(self._potential)
+        return differentiable_states(stepper, *where, watch, self._window, self._relaxing, shown)
 
 
 def _ended(potential: Potential, problem: StepProblem, pos: Tensor) -> _Ended:
@@ -268,6 +275,10 @@ class Simulated(Protocol):
     stepper: Stepper
     potential: Potential
 
+    @property
+    def relaxes(self) -> bool:
+        """Whether a network that restarts from a relaxing step begins with one."""
+
 
 def followed_stepper(
     simulation: Simulated, potential: Potential | None = None, given: Mapping[str, Any] | None = None
@@ -289,11 +300,9 @@ def followed_stepper(
                 "minimum; give hood.simulate(refine='0.01rg'), stepper='newton', or refine=0 for the network alone"
             )
         settings = replace(stepper.settings, target_rg=goal.target, max_iterations=goal.most)
-        solver = NewtonStepper(potential or stepper.potential, settings)
-        solver.gravity = stepper.gravity
-        return solver
+        return _solver(potential or stepper.potential, settings, stepper.gravity)
     if isinstance(stepper, NewtonStepper):
-        return stepper if potential is None else _solver_like(stepper, potential)
+        return stepper if potential is None else _solver(potential, stepper.settings, stepper.gravity)
     network = network_of(stepper)
     if network is None:
         raise ValueError(
@@ -303,7 +312,6 @@ def followed_stepper(
     values = (given or {}).values()
     if any(isinstance(value, Tensor) and value.dtype == torch.float64 for value in values):
         network = _in_double(network)
-    network.use_potential(for_networks(potential or simulation.potential))
     return network
 
 
@@ -356,16 +364,25 @@ def step(
             "simulation.start() or what a step returns"
         )
     given = {"pos": state.pos, "vel": state.vel, "targets": targets, "gravity": gravity, "rest_pos": rest_pos, "flat": flat}
-    stepper = followed_stepper(simulation, potential, given | fabric | constants_of(potential))
+    shown = potential or simulation.potential
+    stepper = followed_stepper(simulation, potential, given | fabric | constants_of(shown))
     dtype = precision_of(stepper)
     cloth = to_device(scene.cloth, dtype=dtype)
     if rest_pos is not None or flat is not None or fabric:
         cloth = with_values(cloth, rest_pos, flat, **fabric)
     scene = replace(scene, cloth=cloth)
     state = State(state.pos.to(dtype), state.vel.to(dtype), state.origin)
-    local = None if targets is None else targets.to(dtype) - state.origin.to(dtype)
-    relaxing = stepper.relaxing is Relaxing.RESTART and frame == 0
-    return step_of_scene(stepper, scene, state, frame, gravity, local, prepare(stepper, scene), relaxing=relaxing)
+    local = None if targets is None else (targets - state.origin.to(targets.device)).to(dtype)
+    relaxing = restarts(simulation, stepper) and frame == 0
+    prepared = prepare(stepper, scene)
+    return step_of_scene(
+        stepper, scene, state, frame, gravity, local, prepared, relaxing=relaxing, potential=for_networks(shown)
+    )
+
+
+def restarts(simulation: Simulated, stepper: NewtonStepper | NetworkStepper) -> bool:
+    """Whether the first step of a simulation, by what :func:`followed_stepper` gives, is a relaxing one."""
+    return simulation.relaxes and stepper.relaxing is Relaxing.RESTART
 
 
 def constants_of(potential: Potential | None) -> dict[str, Any]:
@@ -389,20 +406,21 @@ def _named(name: str, item: Any) -> Iterator[tuple[str, Any]]:
         yield from _named(f"{name}.{key}" if name else str(key), value)
 
 
-def _solver_like(stepper: NewtonStepper, potential: Potential) -> NewtonStepper:
-    solver = NewtonStepper(potential, stepper.settings)
-    solver.gravity = stepper.gravity
+def _solver(potential: Potential, settings: NewtonSettings, gravity: Tensor) -> NewtonStepper:
+    solver = NewtonStepper(potential, settings)
+    solver.gravity = gravity
     return solver
 
 
 def _in_double(network: NetworkStepper) -> NetworkStepper:
-    """The network with weights of float64; kept as long as it lives and its weights stay what they are."""
-    made, versions = made_of(network), [one._version for one in network.parameters()]
+    """The network with weights of float64; kept as long as it lives and its weights and statistics stay what they are."""
+    made, known = made_of(network), [*network.parameters(), *network.buffers()]
+    versions = [(id(one), one._version) for one in known]
     if made.get("double", (None,))[0] != versions:
         copy = network.clone().double().eval()
         copy.network.use_kernels("torch")
         copy.network.use_precision("fp32")
-        copy.gravity = network.gravity.double()
-        made["double"] = versions, copy
+        made["double"] = versions, copy, known  # what is kept alive has its id alone
     found: NetworkStepper = made["double"][1]
+    found.gravity = network.gravity.double()
     return found

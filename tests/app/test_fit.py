@@ -182,6 +182,7 @@ def test_a_fabric_is_fitted_from_the_first_frame_and_a_size_is_not(
         ("noise=-1", "noise=-1: give metres above 0"),
         ("huber=0", "huber=0: give metres above 0"),
         ("whole=true", "whole=true: is for points=true"),
+        ("from_first=true", "from_first=true: is for worn cloth of which all vertices were seen in frame 0"),
         ("every=0", "every=0: must be at least 1"),
         ("refine_mesh=1", "refine_mesh=1: hood fit has no use for it"),
         ("garmnt=tank", "did you mean 'garment'"),

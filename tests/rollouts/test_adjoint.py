@@ -188,13 +188,14 @@ class Learned(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layer = nn.Linear(3, 4, dtype=REAL)
+        self.power = torch.tensor(0.1, dtype=REAL)
         self.listed, self.named = [torch.tensor(0.3, dtype=REAL)], {"size": (torch.tensor(0.2, dtype=REAL),)}
 
     def applies(self, problem: StepProblem) -> bool:
         return True
 
     def forward(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
-        energy = (self.listed[0] * self.layer(20.0 * next_pos) + self.named["size"][0]).square().sum(dim=1)
+        energy = (self.power.exp() * self.listed[0] * self.layer(20.0 * next_pos) + self.named["size"][0]).square().sum(dim=1)
         return problem.sum_vertices(1e-3 * energy)
 
 
@@ -202,7 +203,8 @@ def test_an_own_energy_may_have_tensors_in_lists_and_modules() -> None:
     torch.manual_seed(0)
     own = Learned()
     potential, problem = sheet_on_a_ball(default_potential().with_terms(own=own))
-    given = [one.requires_grad_() for one in (own.layer.weight, own.layer.bias, own.listed[0], own.named["size"][0])]
+    tensors = own.layer.weight, own.layer.bias, own.listed[0], own.named["size"][0], own.power
+    given = [one.requires_grad_() for one in tensors]
     found = torch.autograd.grad(loss((potential, problem)), given)
     for tensor, by in zip(given, found, strict=True):
         way, change, ends = wave(tensor), 1e-5, []
@@ -216,7 +218,7 @@ def test_an_own_energy_may_have_tensors_in_lists_and_modules() -> None:
 def test_tensors_of_own_energies_have_names() -> None:
     found = constants_of(default_potential().with_terms(own=Learned()))
     tensors = {name for name, value in found.items() if isinstance(value, Tensor)}
-    assert tensors == {"own.layer.weight", "own.layer.bias", "own.listed.0", "own.named.size.0"}
+    assert tensors == {"own.layer.weight", "own.layer.bias", "own.listed.0", "own.named.size.0", "own.power"}
     assert found["friction.coefficient"] == 0.5
 
 

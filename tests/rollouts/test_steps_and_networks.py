@@ -153,11 +153,57 @@ def test_a_network_is_told_of_a_fabric_that_differs_from_face_to_face(folder: Pa
     (expected,) = [frame.state for frame in simulated(folder, 2, checkpoint="quickstart", material=fabric, **HANGING)][1:]
     (found,) = hood.differentiable(simulation, lame_mu=mu.float())
     torch.testing.assert_close(found.pos, expected.pos, rtol=0.0, atol=2e-6)
+    (uniform,) = hood.differentiable(simulation, lame_mu=float(mu.mean()))
+    assert (uniform.pos - expected.pos).abs().max() > 1e-5
 
 
-@pytest.mark.parametrize("keys", [EXACT, {"checkpoint": "small1"}])
+def test_every_rollout_of_a_network_looks_at_its_own_potential(folder: Path) -> None:
+    """Also where steps of two are taken in turns; the simulation keeps its own."""
+    simulation = simulated(folder, 3, checkpoint="quickstart", **HANGING)
+    before = [frame.state for frame in simulation]
+    own = simulation.potential
+    lighter = own.only({name: term for name, term in own.terms.items() if name != "gravity"})
+    one, other = (hood.differentiable(simulation, potential=potential) for potential in (lighter, own))
+    turns = [(first, second) for first, second in zip(one, other, strict=True)]
+    for (first, second), expected in zip(turns, before[1:], strict=True):
+        assert torch.equal(second.pos, expected.pos)
+        assert (first.pos - expected.pos).abs().max() > 1e-5
+    (alone, _) = hood.differentiable(simulation, potential=lighter, start=simulation.start())
+    assert torch.equal(alone.pos, turns[0][0].pos)
+    assert torch.equal(hood.step(simulation, simulation.start(), 0, potential=lighter).pos, alone.pos)
+    assert all(torch.equal(frame.state.pos, expected.pos) for frame, expected in zip(simulation, before, strict=True))
+
+
+def test_the_estimate_of_errors_keeps_the_gravity_of_the_simulation(folder: Path) -> None:
+    simulation = simulated(folder, 3, gravity=1.62, **HANGING, **EXACT)
+    found = hood.differentiable(simulation, density=number(0.2, True)).gradients(weigh)
+    assert found.error["density"] < 1e-5
+
+
+def test_a_tensor_that_was_changed_in_place_has_no_gradient_any_more(folder: Path) -> None:
+    for keys, mu in ((EXACT, number(23600.0, True)), ({"checkpoint": "quickstart"}, torch.tensor(23600.0, requires_grad=True))):
+        simulation = simulated(folder, 2, **HANGING, **keys)
+        frames = hood.differentiable(simulation, lame_mu=mu)
+        loss = weigh([*frames])
+        with torch.no_grad():
+            mu *= 1.1
+        with pytest.raises(RuntimeError, match="a tensor was changed in place since the step was taken"):
+            loss.backward()
+        with pytest.raises(RuntimeError, match="a tensor was changed in place"):
+            frames.gradients(weigh)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        EXACT,
+        {"checkpoint": "small1"},
+        {"checkpoint": "paper-fine15-l32-20k"},
+        {"checkpoint": "paper-fine15-l32-20k", "settle": 1},
+    ],
+)
 def test_steps_one_by_one_are_the_frames(folder: Path, keys: dict[str, Any]) -> None:
-    simulation = simulated(folder, 4, **HANGING, **keys)
+    simulation = simulated(folder, 4, **HANGING | keys)
     with torch.no_grad():
         state = simulation.start()
         for frame, expected in enumerate([one.state for one in simulation][1:]):
