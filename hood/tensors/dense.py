@@ -222,6 +222,17 @@ def inputs_followed() -> Iterator[None]:
         _followed = before
 
 
+@contextmanager
+def as_in_training() -> Iterator[None]:
+    """Inside, latents are computed by blocks and compiled kernels while inputs are followed, too: both know their way back."""
+    global _whole
+    before, _whole = _whole, _whole and not _followed
+    try:
+        yield
+    finally:
+        _whole = before
+
+
 def safe_root(square: Tensor) -> Tensor:
     """√ of numbers ≥ 0; while that is :func:`inputs_followed` the derivative at 0 is 0, which else were infinite."""
     if not _followed:

@@ -22,6 +22,7 @@ from hood.model.features.normalizer import RunningNormalizer
 from hood.model.readout import edges
 from hood.solver.newton import NewtonSettings, minimize
 from hood.steppers.network import NetworkStepper, Prediction, build_simulator
+from hood.tensors import dense
 from hood.tensors.batch import without_gradient
 from hood.tensors.conjugate_gradients import Steps
 from hood.testing import grid
@@ -124,6 +125,21 @@ def test_the_gradient_is_that_of_the_stated_loss(model: str, unroll: int, exact:
             values.append(loss())
             weight.data.sub_(step * way)
         assert float(found) == pytest.approx(float(values[0] - values[1]) / 2e-5, rel=1e-6)
+
+
+def test_the_way_back_takes_the_parts_of_the_way_forth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Arrays of several blocks: the first step goes through them by blocks, further ones at once."""
+    found = []
+    for unit in (dense.UNIT, 16):
+        monkeypatch.setattr(dense, "UNIT", unit)
+        monkeypatch.setattr(dense, "BLOCK_BYTES", 1)
+        simulator, potential = in_double(MODELS["local"]), default_potential()
+        part = scene(simulator, Straight())
+        update = plain_update(simulator, simulator, part, potential, Signal("potential"), 9.0, unroll=2)
+        assert update.backward is not None
+        update.backward()
+        found.append(torch.cat([weight.grad.flatten() for weight in simulator.parameters() if weight.grad is not None]))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-6, atol=1e-10)
 
 
 class Exact(torch.nn.Module):

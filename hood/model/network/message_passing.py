@@ -109,7 +109,7 @@ class _EdgeUpdate(torch.autograd.Function):
                 saved += kept
         if keep:
             ctx.save_for_backward(latent, to_edge, *parameters, *saved)
-            ctx.edges, ctx.eps = edges, eps
+            ctx.edges, ctx.eps, ctx.parts = edges, eps, parts
         return updated, received
 
     @staticmethod
@@ -122,7 +122,7 @@ class _EdgeUpdate(torch.autograd.Function):
         layers.start_backward()
         grad_latent, grad_hidden = torch.empty_like(latent), torch.empty_like(latent)
         grad_edge = torch.zeros_like(to_edge, memory_format=torch.contiguous_format)
-        for i, part in enumerate(blocks(latent)):
+        for i, part in enumerate(ctx.parts):
             grad = grad_sum.index_select(0, edges.local_receivers[part]).add_(grad_updated[part])
             before = layers.backward(grad, Kept(*saved[5 * i : 5 * i + 5]), out=grad_hidden[part])
             grad_edge += gram(before, latent[part])

@@ -127,7 +127,8 @@ class _Tail(torch.autograd.Function):
         layers = Layers(hidden.dtype, eps, parameters)
         out = torch.empty_like(hidden if residual is None else residual)
         saved: list[Tensor] = []
-        for part in blocks(hidden):
+        ctx.parts = list(blocks(hidden))  # those that something is kept of, whatever mode the way back is taken in
+        for part in ctx.parts:
             result, kept = layers.forward(torch.relu(hidden[part]))
             if residual is None:
                 out[part] = result
@@ -147,7 +148,7 @@ class _Tail(torch.autograd.Function):
         layers = Layers(ctx.dtype, ctx.eps, parameters)
         layers.start_backward()
         grad_hidden = torch.empty(grad.shape, dtype=ctx.dtype, device=grad.device)
-        for i, part in enumerate(blocks(grad_hidden)):
+        for i, part in enumerate(ctx.parts):
             kept = Kept(*saved[5 * i : 5 * i + 5])
             layers.backward(grad[part].to(ctx.dtype).contiguous(), kept, out=grad_hidden[part])
         return grad_hidden, grad if ctx.needs_input_grad[1] else None, None, None, *layers.grads

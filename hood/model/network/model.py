@@ -31,7 +31,7 @@ from hood.model.kernels.block import check_kernels
 from hood.model.network.message_passing import EdgeDecoder, ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.tensors.dense import PRECISIONS as PRECISIONS
-from hood.tensors.dense import check_precision, is_whole, pad_rows, products, whole_arrays
+from hood.tensors.dense import as_in_training, check_precision, is_whole, pad_rows, products, whole_arrays
 
 #: By class what its parts are, alone or in lists and tables.
 _CLASSES: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {
@@ -271,6 +271,7 @@ class MeshGraphNet(nn.Module):
         self._sums = {}
         return raw, nodes, edges
 
+    @as_in_training()
     def _take(
         self, step: ProcessorStep, sets: tuple[str, ...], graph: Graph, nodes: Tensor, edges: Mapping[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
