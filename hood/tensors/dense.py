@@ -212,7 +212,8 @@ def is_followed() -> bool:
 @contextmanager
 def inputs_followed() -> Iterator[None]:
     """Inside, autograd follows all that a network is told of a step (:func:`unfollowed`), by the forms for whole arrays, which
-    write to no place twice. Training needs none of that: its gradients are by weights."""
+    write to no place twice. Training needs none of that: its gradients are by weights. The mode is one of the process: one
+    thread at a time."""
     global _followed
     before, _followed = _followed, True
     try:

@@ -31,7 +31,7 @@ from hood.model.kernels.block import check_kernels
 from hood.model.network.message_passing import EdgeDecoder, ProcessorStep
 from hood.model.network.mlp import MLP
 from hood.tensors.dense import PRECISIONS as PRECISIONS
-from hood.tensors.dense import as_in_training, check_precision, is_whole, pad_rows, products, whole_arrays
+from hood.tensors.dense import as_in_training, check_precision, pad_rows, products
 
 #: By class what its parts are, alone or in lists and tables.
 _CLASSES: Mapping[type[nn.Module], Mapping[str, type[nn.Module]]] = {
@@ -89,9 +89,9 @@ _PARTS: Mapping[str, type[nn.Module]] = {
 }
 
 
-def _as_now() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
-    """What latents are computed in, and computed in again: both take arrays in the same parts."""
-    return nullcontext(), whole_arrays() if is_whole() else nullcontext()
+def _again() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
+    """What latents are computed in, and computed in again where the way back is followed: by the same parts of arrays."""
+    return nullcontext(), as_in_training()
 
 
 class MeshGraphNet(nn.Module):
@@ -281,7 +281,7 @@ class MeshGraphNet(nn.Module):
         subsets = {name: graph.subset(name, finest_level(sets)) for name in (*sets, *self.world_sets)}
         if self.checkpointing and not inferring:
             taken: tuple[Tensor, dict[str, Tensor]] = checkpoint(
-                step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False, context_fn=_as_now
+                step, nodes, edges, subsets, use_reentrant=False, preserve_rng_state=False, context_fn=_again
             )
             return taken
         taken = step(nodes, edges, subsets, overwrite, self._sums) if overwrite else step(nodes, edges, subsets)
