@@ -16,11 +16,17 @@ method needs of all that block-Jacobi needs:
 
 An iteration of the sweep takes the solver 1.4 to 1.6 times as long as one of block-Jacobi, whatever the size; with a coarse
 level there would be the product with it, and to set it up once an iteration of Newton's method.
+
+``--time`` prints instead what an iteration of the solver's own conjugate gradients takes, and what the matrix does: the least
+of seven times.
+
+    python benchmarks/preconditioners.py dress dress_4k dress_12k --time
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -206,12 +212,39 @@ def compare(system: System, kept: dict[int, Apply]) -> dict[str, int]:
     return counts
 
 
+def times(garment: str, motion: str, rounds: int = 7, count: int = 100) -> tuple[int, float, float]:
+    """Free vertices of a garment, and seconds of an iteration of the solver's conjugate gradients and of its matrix."""
+    scene, potential = make_scene(garment, motion), default_potential()
+    state = scene.start(0)
+    problem = in_double(potential.prepare(StepProblem(scene.cloth, state, scene.step_input(0, state))))
+    system = CompiledSystem(potential, problem, plan_for(problem), count)
+    system.begin(None)
+    engine, right = system.engines[0], np.random.default_rng(0).normal(size=tuple(state.pos.shape))
+    found, solves, matrices = np.zeros_like(right), [], []
+    for _ in range(rounds):
+        engine.model()
+        began = time.perf_counter()
+        engine.matrix()
+        matrices.append(time.perf_counter() - began)
+        began, used = time.perf_counter(), engine.values.cg_used
+        engine.solve(right, 1e-30, count, found)
+        solves.append((time.perf_counter() - began) / (engine.values.cg_used - used))
+    return engine.values.num_rows, min(solves), min(matrices)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garments", nargs="*", default=["dress", "dress_4k"])
     parser.add_argument("--motion", default="dance_mixed")
     parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--time", action="store_true", help="what an iteration takes")
     arguments = parser.parse_args()
+    if arguments.time:
+        print(f"{'garment':10}{'free vertices':>15}{'iteration [µs]':>16}{'matrix [ms]':>13}")
+        for garment in arguments.garments:
+            size, iteration, matrix = times(garment, arguments.motion)
+            print(f"{garment:10}{size:15}{1e6 * iteration:16.1f}{1e3 * matrix:13.2f}", flush=True)
+        return
     for index, garment in enumerate(arguments.garments):
         kept: dict[int, Apply] = {}
         found = [compare(system, kept) for system in systems(garment, arguments.motion, arguments.frames)]

@@ -766,6 +766,18 @@ template <class T> void sharpen(Engine& e, double indefinite_share) {
 // preconditioner B (Eisenstat 1981): an iteration goes through the blocks once backwards and once forwards, and there is no
 // product with H beside. Threads sweep over parts of their own; what couples the parts, and cloth with near cloth, is in H alone.
 
+// The sums of the first three numbers of each of three vectors.
+template <class V4> inline V4 sum_axes(V4 a, V4 b, V4 c) {
+#if defined(__clang__) || __GNUC__ >= 12
+    const V4 none = {}, low = __builtin_shufflevector(a, b, 0, 4, 1, 5), high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+    const V4 other_low = __builtin_shufflevector(c, none, 0, 4, 1, 5), other_high = __builtin_shufflevector(c, none, 2, 6, 3, 7);
+    const V4 x = __builtin_shufflevector(low, other_low, 0, 1, 4, 5), y = __builtin_shufflevector(low, other_low, 2, 3, 6, 7);
+    return (x + y) + __builtin_shufflevector(high, other_high, 0, 1, 4, 5);
+#else
+    return V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], 0};
+#endif
+}
+
 template <class T, class V4> inline V4 by_block(const T* m, V4 v) { return load<V4>(m) * v[0] + load<V4>(m + 4) * v[1] + load<V4>(m + 8) * v[2]; }
 
 // p' = z + share p', p from it, and (D - B) p + U p in the place of z, of some rows of a part that ends at a row.
@@ -778,23 +790,24 @@ template <class T, bool INSIDE> inline void sweep_back(const Engine& e, Range ra
         const V4 along = load<V4>(q + 4 * row) + share * load<V4>(turned + 4 * row);
         store(turned + 4 * row, along);
         V4 a = V4{}, b = V4{}, c = V4{};
-        const int32_t first = starts[row];
-        for (int32_t i = starts[row + 1] - 1; i > first; --i) {
-            if (!INSIDE && cols[i] >= end) continue;
-            const T* m = matrix + 9 * (int64_t)i;
-            const V4 other = load<V4>(p + 4 * (int64_t)cols[i]);
+        const int64_t first = starts[row];
+        const T *own = matrix + 9 * first, *m = matrix + 9 * (int64_t)starts[row + 1];
+#pragma GCC unroll 4
+        for (const int32_t* col = cols + starts[row + 1] - 1; col > cols + first; --col) {
+            m -= 9;
+            if (!INSIDE && *col >= end) continue;
+            const V4 other = load<V4>(p + 4 * (int64_t)*col);
             a += load<V4>(m) * other, b += load<V4>(m + 3) * other, c += load<V4>(m + 6) * other;
         }
-        const V4 above = {a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)}, rest = along - above;
+        const V4 above = sum_axes(a, b, c), rest = along - above;
         const V4 step = by_block<T>(inverse + 12 * row, rest);
-        const T* own = matrix + 9 * (int64_t)first;
         store(p + 4 * row, step);
         store(q + 4 * row, load<V4>(own) * step[0] + load<V4>(own + 3) * step[1] + load<V4>(own + 6) * step[2] + above - rest);
     }
 }
 
 // q = p + (B + L)^-1 q of a part; their p' . q.
-template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range range) {
+template <class T, bool FROM_ZERO, bool INSIDE> inline D4 sweep_on(const Engine& e, Range range) {
     typedef typename Four<T>::type V4;
     const T *matrix = (const T*)e.matrix, *inverse = (const T*)e.inverse, *p = (const T*)e.p, *turned = (const T*)e.z;
     T* q = (T*)e.q;
@@ -802,11 +815,14 @@ template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range ran
     D4 sum = D4{};
     for (int64_t row = range.begin; row < range.end; ++row) {
         const V4 step = by_block<T>(inverse + 12 * row, load<V4>(q + 4 * row));
-        const T x = step[0], y = step[1], z = step[2];
-        for (int32_t i = starts[row] + 1; i < starts[row + 1]; ++i) {
-            if (cols[i] >= range.end) break;
-            const T* m = matrix + 9 * (int64_t)i;
-            T* target = q + 4 * (int64_t)cols[i];
+        const V4 x = V4{} + step[0], y = V4{} + step[1], z = V4{} + step[2];
+        const T* m = matrix + 9 * (int64_t)starts[row];
+        const int32_t* end = cols + starts[row + 1];
+#pragma GCC unroll 4
+        for (const int32_t* col = cols + starts[row] + 1; col < end; ++col) {
+            if (!INSIDE && *col >= range.end) break;
+            m += 9;
+            T* target = q + 4 * (int64_t)*col;
             store(target, load<V4>(target) - (load<V4>(m) * x + load<V4>(m + 3) * y + load<V4>(m + 6) * z));
         }
         const V4 product = FROM_ZERO ? step : load<V4>(p + 4 * row) + step;
@@ -814,6 +830,10 @@ template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range ran
         if (!FROM_ZERO) sum += __builtin_convertvector(product * load<V4>(turned + 4 * row), D4);
     }
     return sum;
+}
+
+template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range range) {
+    return range.end == e.num_rows ? sweep_on<T, FROM_ZERO, true>(e, range) : sweep_on<T, FROM_ZERO, false>(e, range);
 }
 
 template <class T> void sweep_back(const Engine& e, int64_t part, T share) {

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix, triu
 from test_newton import batch, falling, hanging, pieces
 from test_plan import states, touching_sheet
 
@@ -23,6 +24,7 @@ from hood.solver import newton
 from hood.solver.compiled import newton as engine
 from hood.solver.compiled import system as compiled_system
 from hood.solver.compiled.system import CompiledScene, CompiledSystem
+from hood.solver.compiled.tables import _by_levels, build_tables
 from hood.solver.newton import NewtonSettings, TorchSystem, minimize
 from hood.solver.system import linear
 from hood.solver.system.iterate import Unknowns
@@ -301,3 +303,30 @@ def test_a_vertex_may_have_hundreds_of_neighbours():
     _, expected = minimize(default_potential(), problem, settings=replace(TORCH, max_iterations=1))
     _, report = minimize(default_potential(), problem, settings=replace(COMPILED, max_iterations=1))
     torch.testing.assert_close(report.phi, expected.phi, rtol=1e-6, atol=0)
+
+
+def sizes_of_rows(tables) -> tuple[np.ndarray, np.ndarray]:
+    """How far the first block beside the diagonal of every row is behind it, and how many blocks the row has."""
+    count = np.diff(tables.row_starts)
+    beside = np.append(tables.cols, -1)[tables.row_starts[:-1] + 1]
+    return np.where(count > 1, beside - np.arange(tables.num_rows), tables.num_rows), count
+
+
+def test_rows_wait_for_no_neighbour_in_the_order_and_end_where_the_one_before_did(tank_scene):
+    behind, count = sizes_of_rows(build_tables(tank_scene.cloth, None, 0))
+    assert np.mean(behind == 1) < 0.1  # 0.5 in the order of Cuthill and McKee alone
+    assert np.mean(np.diff(count) != 0) < 0.6  # 0.8
+
+
+def test_the_order_of_the_rows_leads_to_the_triangles_of_cuthill_and_mckee():
+    generator = np.random.default_rng(0)
+    size = 300
+    rows, cols = generator.integers(0, size, (2, 1500))
+    graph = csr_matrix((np.ones(1500, np.int8), (rows, cols)), shape=(size, size))
+    graph = (graph + graph.T).tocsr()
+    order = generator.permutation(size)
+    place = np.empty(size, np.int64)
+    place[_by_levels(graph, order)] = np.arange(size)
+    assert sorted(place.tolist()) == list(range(size))
+    before, after = triu(graph[order][:, order], k=1).nonzero()
+    assert (place[before] < place[after]).all()
