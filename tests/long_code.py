@@ -7,6 +7,7 @@ MODULES = {
     "hood/app/batch/engines.py": "four engines with one task, of which the pool of processes is a part",
     "hood/app/batch/rows.py": "what a row is: from lists, tables and files, with its name and its seed",
     "hood/app/batch/work.py": "one row: who takes it, how it is made, how it gets its place",
+    "hood/app/output/view.py": "what shows rollouts: the page, and pictures while and after frames are simulated",
     "hood/app/output/export.py": "one command: what may be written, what was there before, images on garments, the write",
     "hood/app/fit.py": "one command: what may be fitted, its scene, its search and its files",
     "hood/app/rollout.py": "one rollout from its words to its summary",

@@ -25,7 +25,7 @@ from hood.app.batch.batch import (
     with_one_stepper,
     write_overview,
 )
-from hood.app.common import output_folder, picture_of, prepare_folder, together, video_of
+from hood.app.common import output_folder, prepare_folder, together
 from hood.app.notices import Bar, Heard, collected, heard, say, tell_how_far
 from hood.app.output.export import (
     StreamedCaches,
@@ -33,12 +33,12 @@ from hood.app.output.export import (
     check_worn,
     export_beside,
     forms_beside,
-    lay_on,
     read_textures,
     remove_earlier,
 )
 from hood.app.output.frames import at_output_fps, finer_mesh, on_finer_mesh, planned_steps, refined_still, stored_body
 from hood.app.output.summary import describe, describe_all, summarise
+from hood.app.output.view import FilmAlongside, draw
 from hood.app.plan_file import plan_mode, plan_path, plan_sentences, planned, rollout_config, summarise_plan, without_accuracy
 from hood.app.progress import ProgressFile, RolloutProgress, find_progress, memories, recall
 from hood.app.scene.events import describe_held, fastening_attributes, summarise_held
@@ -208,22 +208,25 @@ def _run_there(
     warned += [] if begun is None else [sentence for sentence in begun.warnings if sentence not in warned]
     kept = ProgressFile(folder, scene, stepper)
     caches = StreamedCaches(folder / "rollout.h5", forms_beside(config), read_textures(config))
-    with closing(caches):
-        interrupted = _simulate_to_disk(ready, digest, folder / "rollout.h5", asked, eases, warned, bar, caches, kept, begun)
-    data = read_rollout(folder / "rollout.h5")
-    if not interrupted:
-        make_compact(folder / "rollout.h5", store_of(config.formats), body)
     exported: Sequence[str] = []
-    try:
-        with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn
-            judged = beside.submit(summarise, data)
-            if not interrupted:
-                _draw(config, data, folder, bar)
-                exported = export_beside(folder / "rollout.h5", forms_beside(config), read_textures(config), caches)
-    finally:
-        summary = _conclude(ready, folder, data, judged.result(), eases, advise)
-        summary["warnings"] = list(warned)
-        _write_json(folder / "summary.json", summary)
+    path, count = folder / "rollout.h5", min(int(config.num_frames), scene.num_frames)
+    with closing(FilmAlongside(config, scene.motion, 0 if begun is not None else count, folder)) as film:
+        with closing(caches):
+            interrupted = _simulate_to_disk(ready, digest, path, asked, eases, warned, bar, caches, film, kept, begun)
+        data = read_rollout(path)
+        if not interrupted:
+            make_compact(path, store_of(config.formats), body)
+        try:
+            with ThreadPoolExecutor(1) as beside:  # it is judged while it is drawn
+                judged = beside.submit(summarise, data)
+                if not interrupted:
+                    if not film.finish(bar):
+                        draw(config, data, folder, bar)
+                    exported = export_beside(path, forms_beside(config), read_textures(config), caches)
+        finally:
+            summary = _conclude(ready, folder, data, judged.result(), eases, advise)
+            summary["warnings"] = list(warned)
+            _write_json(folder / "summary.json", summary)
     if not interrupted:
         kept.remove()
     _tell(exported)
@@ -290,12 +293,14 @@ def _simulate_to_disk(
     warned: Heard,
     bar: Bar,
     caches: StreamedCaches,
+    film: FilmAlongside,
     kept: ProgressFile,
     begun: RolloutProgress | None,
 ) -> bool:
-    """Stream the rollout into ``path`` and ``caches``, and into ``kept`` where it is; True when the user interrupted it. What
-    was ``begun`` goes on. ``asked`` is the config with ``auto`` in it, ``warned`` holds the doubts about its inputs. Where a
-    size was asked for, how the garment sat is added to ``eases``, at the beginning and the end."""
+    """Stream the rollout into ``path`` and ``caches``, and into ``kept`` where it is; the ``film`` is told of every frame. True
+    when the user interrupted it. What was ``begun`` goes on. ``asked`` is the config with ``auto`` in it, ``warned`` holds the
+    doubts about its inputs. Where a size was asked for, how the garment sat is added to ``eases``, at the beginning and the
+    end."""
     config, scene, stepper, potential = ready.config, ready.scene, ready.stepper, ready.potential
     guard = make_guard(config, stepper, potential)
     if begun is not None:
@@ -388,6 +393,7 @@ def _simulate_to_disk(
                 fields = {name: values.numpy() for name, values in frame.fields.items()}
                 writer.append(frame.world_pos.numpy(), frame.body_pos.numpy(), frame.metrics, fields)
                 caches.append(frame.world_pos.numpy(), frame.body_pos.numpy())
+                film.tell()
             write_alarms(writer, guard)
             if guard is not None and guard.stopped is not None:
                 raise GuardStopped
@@ -403,41 +409,6 @@ def _simulate_to_disk(
             say(f"hood: {writer.frames_done} frames are kept in {path}; the same command with resume=true goes on", error=True)
         raise
     return False
-
-
-def _draw(config: RolloutSettings, data: RolloutData, folder: Path, bar: Bar) -> None:
-    """Video and contact sheet, when the picture libraries are installed."""
-    kind, stride = video_of(config)
-    if kind == "none" and not bool(config.sheet):
-        return
-    try:
-        from hood.media.film import Film, Shots, sheet_frames, write_sheet, write_video
-    except ImportError as error:
-        say(f"no pictures: {error}", error=True)
-        return
-    asked = picture_of(config, kind)
-    film = Film(
-        data,
-        asked.width or 0,
-        asked.height or 0,
-        colour=str(config.colour),
-        thinner=1e-3 * asked.thin_body,
-        textures=lay_on(read_textures(config), [data])[0],
-        shots=Shots.of(asked.views, asked.camera, asked.background, asked.fabric_looks),
-    )
-    pictures: dict[int, Any] = {}
-    if kind != "none":
-        chosen = range(0, len(data.cloth_pos), stride)
-        kept = sheet_frames(len(data.cloth_pos)) if bool(config.sheet) else ()
-        _, pictures = write_video(
-            film,
-            folder / ("rollout_png" if kind == "png" else f"rollout.{kind}"),
-            bar(chosen, len(chosen), "video"),
-            stride,
-            kept,
-        )
-    if bool(config.sheet):
-        write_sheet(film, folder / "contact_sheet.png", pictures)
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, stdtrit
 
 #: Chance that an interval covers what infinitely many rollouts would give.
 LEVEL = 0.95
@@ -41,7 +41,7 @@ def interval(samples: np.ndarray, level: float = LEVEL, rollouts: int | None = N
         return float("nan"), float("nan")
     outside = (1.0 - level) / 2
     if rollouts is not None and rollouts > 1:
-        outside = float(norm.cdf(-np.sqrt(rollouts / (rollouts - 1)) * t.ppf(1.0 - outside, rollouts - 1)))
+        outside = float(ndtr(-np.sqrt(rollouts / (rollouts - 1)) * stdtrit(rollouts - 1, 1.0 - outside)))
     # No interpolation: between a number and infinity there is nothing.
     low = float(np.quantile(samples, outside, method="lower"))
     return low, float(np.quantile(samples, 1.0 - outside, method="higher"))

@@ -5,10 +5,7 @@ Views: from where a film shows the body, side by side, and cameras that have all
 
 from __future__ import annotations
 
-import os
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,7 +31,7 @@ from hood.media.renderer.render import (
     render_views,
 )
 from hood.media.renderer.shading import CLEAR, Background
-from hood.media.video import save_png, smaller, video_writer
+from hood.media.video import drawn, save_png, smaller, video_writer
 from hood.mesh.editing.subdivision import Extrusion
 from hood.mesh.topology import connected_components, counted_edges
 from hood.rollouts.file.reader import RolloutData
@@ -50,11 +47,9 @@ _MARGIN = 1.18
 _ENDS = 0.4
 #: Cloth farther than this [m] from the body's box does not widen the picture: it blew up.
 _ASTRAY = 0.6
-#: Frames that are drawn at once at most; each takes some 30 MB.
-_THREADS = 8
 _SMOOTHING = 15  # frames over which the camera averages the walker's path
-
-
+#: Decimals of places [m] on its path and of where it stands: what positions are rounded by does not move it.
+_DIGITS, _COARSE = 4, 3
 #: By its name, the direction [degrees] from which a view shows the body in the first frame; front and back from a little aside.
 AZIMUTHS = {"front": 20.0, "side": 90.0, "back": 200.0}
 #: The view that goes round.
@@ -62,9 +57,11 @@ TURNTABLE = "turntable"
 _ELEVATION = 8.0  # degrees
 #: Room around the body as a share of it, and directions of the circles that stand for it where the camera goes round.
 _WHOLE_MARGIN, _ROUND = 1.06, 24
+_FULL = 0.98  # share of half a picture that cloth may take beside the body
 #: Height of a cell of a sheet of several views [pixels], and width as a share of its height at least.
 _CELL, _NARROW = 420, 0.42
 _DIVIDER = 2  # pixels between views
+_Clouds = Sequence[tuple[int, np.ndarray]]  # frames and points (N, 3) in them
 
 
 @dataclass(frozen=True)
@@ -145,7 +142,7 @@ class Film:
         self._hem = np.full(len(number), FAR) if self.colouring else hem_distance(data.rest_pos, data.cloth_faces)
         self._unsewn = None if self.colouring else between_hems(data.cloth_faces)
         self._closed = _is_closed(data.body_pos[0], data.body_faces)
-        self._floor = float(shown[..., 1].min())
+        self._floor = round(float(shown[..., 1].min()), _DIGITS)
         if shots is not None:
             self._takes = _takes(shots, [data, *beside], self._path, self._panel / height)
         else:
@@ -170,6 +167,14 @@ class Film:
     def _panel(self) -> int:
         """Width of the picture of a view [pixels]."""
         return -(-self.width // (1 if self.shots is None else len(self.shots.views)))
+
+    def sees_as(self, other: Film) -> bool:
+        """Whether cameras and floor are those of another film of as many frames: both draw a frame in the same way. How wide
+        the cloth is, which cells of the sheet have to know, is then taken from there."""
+        mine, theirs = ([(take.camera, take.follows, take.turns) for take in film._takes] for film in (self, other))
+        same = mine == theirs and self._floor == other._floor and np.array_equal(self._path, other._path)
+        self._takes = other._takes if same else self._takes
+        return same
 
     def frame(self, index: int) -> np.ndarray:
         """Picture (H, W, 3) uint8 of frame ``index``, with the bar of its colours."""
@@ -212,7 +217,7 @@ class Film:
         already, by their frames."""
         chosen, known = sheet_frames(len(self.data.cloth_pos), count), known or {}
         missing = [index for index in chosen if index not in known]
-        pictures = {**known, **dict(drawn(self, missing))}
+        pictures = {**known, **dict(drawn(self.frame, missing))}
         times = [f"{self.data.time[i]:.2f} s" for i in chosen]
         if self.shots is None:
             return contact_sheet([pictures[i] for i in chosen], columns, times)
@@ -246,12 +251,18 @@ def write_sheet(film: Film, path: Path, known: Mapping[int, np.ndarray] | None =
 
 
 def write_video(
-    film: Film, path: Path, frames: Iterable[int] | None = None, stride: int = 1, kept: Sequence[int] = ()
+    film: Film,
+    path: Path,
+    frames: Iterable[int] | None = None,
+    stride: int = 1,
+    kept: Sequence[int] = (),
+    busy: Callable[[], bool] = bool,
 ) -> tuple[Path, dict[int, np.ndarray]]:
     """Video at the rollout's own speed; every ``stride``-th frame is drawn. A path without a suffix is a folder of PNG files.
 
     Args:
         frames: the iterable that drives the loop (a progress bar, say); all frames by default.
+        busy: as of :func:`hood.media.video.drawn`.
 
     Returns:
         The file written, and the pictures of the frames ``kept`` that it holds.
@@ -259,34 +270,11 @@ def write_video(
     chosen = range(0, len(film.data.cloth_pos), stride) if frames is None else frames
     pictures: dict[int, np.ndarray] = {}
     with video_writer(path, fps=1.0 / (seconds_per_frame(film.data) * stride)) as writer:
-        for index, picture in drawn(film, chosen):
+        for index, picture in drawn(film.frame, chosen, busy):
             writer.append(picture)
             if index in kept:
                 pictures[index] = picture
     return writer.path, pictures
-
-
-def drawn(film: Film, frames: Iterable[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Frames and their pictures (H, W, 3) uint8, in their order; drawn some frames ahead, by as many threads as this process
-    may use processors, up to :data:`_THREADS`: no picture depends on their number."""
-    threads = min(_THREADS, _processors())
-    if threads == 1:
-        yield from ((index, film.frame(index)) for index in frames)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        ahead: deque[tuple[int, Future[np.ndarray]]] = deque()
-        for index in frames:
-            ahead.append((index, pool.submit(film.frame, index)))
-            if len(ahead) > threads:
-                first, picture = ahead.popleft()
-                yield first, picture.result()
-        for first, picture in ahead:
-            yield first, picture.result()
-
-
-def _processors() -> int:
-    affinity = getattr(os, "sched_getaffinity", None)  # not every system has it
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def _prints(data: RolloutData, textures: Mapping[str, Texture]) -> list[Print]:
@@ -339,14 +327,14 @@ def _framed(rollouts: Sequence[RolloutData], path: np.ndarray) -> np.ndarray:
 
 def _smooth_path(body_pos: np.ndarray) -> np.ndarray:
     """(T, 3): the body's centre seen from above, averaged over time; height is left alone so that jumps are seen."""
-    centre = body_pos.mean(axis=1)
+    centre = body_pos.mean(axis=1, dtype=np.float64)
     centre[:, 1] = 0.0
     window = min(_SMOOTHING, len(centre))
     padded = np.concatenate([np.repeat(centre[:1], window, 0), centre, np.repeat(centre[-1:], window, 0)])
     kernel = np.hanning(2 * window + 1)[1:-1] if window > 1 else np.ones(1)
     kernel /= kernel.sum()
     smooth = np.stack([np.convolve(padded[:, axis], kernel, mode="same") for axis in range(3)], axis=1)
-    return smooth[window : window + len(centre)]
+    return np.asarray(smooth[window : window + len(centre)].round(_DIGITS))
 
 
 @dataclass(frozen=True)
@@ -375,55 +363,69 @@ class _Take:
 
 
 def _takes(shots: Shots, rollouts: Sequence[RolloutData], path: np.ndarray, aspect: float) -> list[_Take]:
-    """A take for every view, as near as it can be with all of bodies and cloth in every frame; all equally far."""
-    clouds, found = _clouds(rollouts), list[tuple[_Take, np.ndarray]]()
+    """A take for every view, all equally far: as near as it can be with all of the bodies in every frame, and with the cloth
+    where that is not in such a picture as well."""
+    bodies, cloths = _clouds(rollouts)
+    found = list[tuple[_Take, np.ndarray]]()
     for view in shots.views:
         turns, name = shots.camera == "orbit" or view == TURNTABLE, "front" if view == TURNTABLE else view
         azimuth = AZIMUTHS[name] if isinstance(name, str) else float(name)
         follows = turns or shots.camera == "follow"
         lens = {"azimuth_deg": azimuth, "elevation_deg": _ELEVATION, "aspect": aspect, "margin": _WHOLE_MARGIN}
         about = path if follows else np.zeros_like(path)
-        points = _round(clouds, about) if turns else _outermost(clouds, about, Camera.framing(np.zeros((1, 3)), **lens), aspect)
-        found.append((_Take(Camera.framing(points, **lens), follows, turns, 1.0), points))
+        ahead = Camera.framing(np.zeros((1, 3)), **lens)
+        points, worn = (_round(some, about) if turns else _outermost(some, about, ahead, aspect) for some in (bodies, cloths))
+        camera = Camera.framing(points, **lens)
+        if max(_shares(camera, worn, aspect)) > _FULL:
+            camera = Camera.framing(np.concatenate([points, worn]), **lens)
+        found.append((_Take(camera, follows, turns, 1.0), np.concatenate([points, worn])))
     far = max(float(np.linalg.norm(np.subtract(take.camera.position, take.camera.target))) for take, _ in found)
     return [_moved_back(take, far, points, aspect) for take, points in found]
 
 
 def _moved_back(take: _Take, far: float, points: np.ndarray, aspect: float) -> _Take:
-    axes = take.camera.axes()
-    x, y, z = (np.asarray(take.camera.target) - far * axes[2]).tolist()
-    across, _, depth = ((points - [x, y, z]) @ axes.T).T
-    wide = float(np.abs(across / depth).max()) / (aspect * float(np.tan(np.radians(take.camera.fov) / 2)))
-    return replace(take, camera=replace(take.camera, position=(x, y, z)), half_width=min(1.1 * wide, 1.0))
+    target = np.round(take.camera.target, _COARSE)
+    position = np.round(target - round(far, _COARSE) * take.camera.axes()[2], 2 * _COARSE)
+    (x, y, z), (u, v, w) = position.tolist(), target.tolist()
+    camera = replace(take.camera, position=(x, y, z), target=(u, v, w))
+    return replace(take, camera=camera, half_width=min(1.1 * _shares(camera, points, aspect)[0], 1.0))
 
 
-def _clouds(rollouts: Sequence[RolloutData]) -> list[tuple[int, np.ndarray]]:
-    """Frames, and the points (N, 3) in them: the body, and the cloth that is not astray."""
-    clouds = []
+def _shares(camera: Camera, points: np.ndarray, aspect: float) -> tuple[float, float]:
+    """Shares of half a picture that points (N, 3) take from its middle, across and up, at most; vast behind the camera."""
+    seen = (points - camera.position) @ camera.axes().T
+    ahead = np.maximum(seen[:, 2:], 1e-9)
+    wide, high = (np.abs(seen[:, :2]) / ahead).max(axis=0, initial=0.0) / np.tan(np.radians(camera.fov) / 2)
+    return float(wide / aspect), float(high)
+
+
+def _clouds(rollouts: Sequence[RolloutData]) -> tuple[_Clouds, _Clouds]:
+    """Frames and the points (N, 3) in them: of bodies, and of cloth that is not astray; without a body of the cloth, twice."""
+    bodies, cloths = list[tuple[int, np.ndarray]](), list[tuple[int, np.ndarray]]()
     for data in rollouts:
         for frame, (body, cloth) in enumerate(zip(data.body_pos, data.cloth_pos, strict=True)):
             near = np.isfinite(cloth).all(axis=1)
             if len(body):
                 low, high = body.min(axis=0) - _ASTRAY, body.max(axis=0) + _ASTRAY
                 near = ((cloth >= low) & (cloth <= high)).all(axis=1)  # false for NaN
-            cloud = np.concatenate([body, cloth if near.all() else cloth[near]])
-            if len(cloud):
-                clouds.append((frame, cloud))
-    if not clouds:
+                bodies.append((frame, body))
+            if near.any():
+                cloths.append((frame, cloth if near.all() else cloth[near]))
+    if not bodies and not cloths:
         raise ValueError("the rollout has no finite positions to draw")
-    return clouds
+    return bodies or cloths, cloths
 
 
-def _outermost(clouds: Sequence[tuple[int, np.ndarray]], path: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
+def _outermost(clouds: _Clouds, path: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
     """Points (N, 3) about the path (T, 3) that a picture holds which holds all: those beyond which no edge of it is moved."""
     right, up, forward = camera.axes()
     tan = np.tan(np.radians(camera.fov) / 2) / _WHOLE_MARGIN
     edges = np.array([sign * side - slope * forward for side, slope in ((right, tan * aspect), (up, tan)) for sign in (1, -1)])
     rows = [cloud[np.argmax(edges.astype(cloud.dtype) @ cloud.T, axis=1)] - path[frame] for frame, cloud in clouds]
-    return np.concatenate(rows, dtype=np.float64)
+    return np.concatenate([np.zeros((0, 3)), *rows])
 
 
-def _round(clouds: Sequence[tuple[int, np.ndarray]], path: np.ndarray) -> np.ndarray:
+def _round(clouds: _Clouds, path: np.ndarray) -> np.ndarray:
     """The same for a camera that goes round: circles (N, 3) of the points farthest from the axis, above and below."""
     slopes = np.linspace(0.0, 2.0 * np.pi, _ROUND, endpoint=False)
     rows = []
@@ -432,7 +434,7 @@ def _round(clouds: Sequence[tuple[int, np.ndarray]], path: np.ndarray) -> np.nda
         flat = np.stack([np.hypot(away[:, 0], away[:, 2]), away[:, 1]])
         ends = np.unique(np.argmax(np.stack([np.cos(slopes), np.sin(slopes)], axis=1) @ flat, axis=1))
         rows.append(flat[:, ends])
-    radius, high = np.concatenate(rows, axis=1)[..., None]
+    radius, high = np.concatenate([np.zeros((2, 0)), *rows], axis=1)[..., None]
     return np.stack([radius * np.sin(slopes), high + 0.0 * slopes, radius * np.cos(slopes)], axis=-1).reshape(-1, 3)
 
 

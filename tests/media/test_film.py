@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from hood.assets.formats.raw_mesh import Texture
-from hood.media.film import Film, drawn
+from hood.media.film import Film
+from hood.media.video import drawn
 from hood.rollouts.file.reader import RolloutData
 from hood.testing import cylinder, grid, sphere
 
@@ -82,9 +83,9 @@ def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, mon
         time.sleep(0.02)  # so that one thread cannot do it all
         return Film.frame(film, index)
 
-    monkeypatch.setattr("hood.media.film._processors", lambda: threads)
+    monkeypatch.setattr("hood.media.video.processors", lambda: threads)
     monkeypatch.setattr(film, "frame", seen)
-    pairs = list(drawn(film, iter((6, 0, 3, 3, 1))))
+    pairs = list(drawn(film.frame, iter((6, 0, 3, 3, 1))))
     assert [index for index, _ in pairs] == [6, 0, 3, 3, 1]
     found = [picture for _, picture in pairs]
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
@@ -94,9 +95,9 @@ def test_frames_that_are_drawn_ahead_are_the_same_and_in_order(threads: int, mon
 
 def test_a_frame_that_cannot_be_drawn_ends_the_film(monkeypatch: pytest.MonkeyPatch) -> None:
     film = Film(ball_in_a_tube(), 96, 128)
-    monkeypatch.setattr("hood.media.film._processors", lambda: 2)
+    monkeypatch.setattr("hood.media.video.processors", lambda: 2)
     with pytest.raises(IndexError):
-        list(drawn(film, [0, 99]))
+        list(drawn(film.frame, [0, 99]))
 
 
 def _napkin(fabric: str) -> RolloutData:

@@ -50,6 +50,23 @@ def test_the_whole_body_is_in_every_view_of_every_frame(camera: str) -> None:
     assert np.ptp(distances) < 1e-9
 
 
+def test_cloth_that_comes_towards_the_camera_is_in_the_picture() -> None:
+    """A doll, and a strip that would be beside or behind a camera that looked at the doll alone."""
+    ball, ball_faces = sphere(2, 0.1)
+    towards = np.array([0.34, 0.14, 0.93])
+    along = np.linspace(0.0, 0.68, 24)[:, None] * towards
+    strip = np.concatenate([along - [0.1, 0.0, 0.0], along + [0.1, 0.0, 0.0]]) + [0.0, 1.0, 0.0]
+    first = np.arange(23)
+    faces = np.concatenate([np.stack([first, first + 1, first + 24], 1), np.stack([first + 1, first + 25, first + 24], 1)])
+    body = (ball + [0.0, 1.0, 0.0])[None]
+    data = RolloutData(strip[None], faces, strip, body, ball_faces, np.zeros(1), {}, {})
+    (take,) = Film(data, 320, 320, shots=Shots(("front",)))._takes
+    x, y, depth = ((np.concatenate([strip, body[0]]) - take.camera.position) @ take.camera.axes().T).T
+    half = np.tan(np.radians(take.camera.fov) / 2)
+    assert depth.min() > 0.0
+    assert max(np.abs(x / depth).max(), np.abs(y / depth).max()) < half
+
+
 def test_cameras_that_follow_move_smoothly_and_fixed_ones_do_not() -> None:
     data = walker(30)
     for camera, steps in (("follow", 1e-2), ("fixed", 1e-12)):
