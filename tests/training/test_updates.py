@@ -99,13 +99,15 @@ def both(
             assert value == pytest.approx(expected.measured[name], rel=1e-3, abs=1e-6), name
     assert figures.lost == expected.lost
     torch.testing.assert_close(figures.centres, expected.centres, rtol=0, atol=2e-6)
+    # What all of them have in common is rounded: small gradients are sums of large ones that cancel.
+    rounding = 1e-5 * max(float(gradient.abs().max()) for gradient in gradients.values() if gradient is not None)
     for name, parameter in simulator.named_parameters():
         expected_gradient = gradients[name]
         if expected_gradient is None:
             assert not parameter.grad.any()
         else:
             most = float(expected_gradient.abs().max())
-            torch.testing.assert_close(parameter.grad, expected_gradient, rtol=0, atol=APART * most + 1e-9, msg=name)
+            torch.testing.assert_close(parameter.grad, expected_gradient, rtol=0, atol=APART * most + rounding, msg=name)
     if len(parts) == 1:
         for name, value in simulator.named_buffers():
             torch.testing.assert_close(value, counted[name], rtol=1e-6, atol=1e-9, msg=name)

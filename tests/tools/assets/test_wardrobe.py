@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from hood.assets.body.body import Body
 from hood.assets.files.library import DATA_FOLDER, names
 from hood.assets.garment.binding import posed_body, signed_distances
-from hood.assets.garment.garment import load_garment
+from hood.assets.garment.garment import Garment, load_garment
 from hood.assets.motion.sequence_edit import arms_down
 from hood.assets.pattern.designs import DESIGNS, draft
 from hood.assets.pattern.measures import measure_body
@@ -60,15 +61,32 @@ def test_nothing_passes_through_anything(name: str, body: Body) -> None:
     assert signed_distances(garment.rest_pos[trunk], skin.surface, skin.faces).min() > 0.0
 
 
+def triangles(faces: np.ndarray) -> set[tuple[int, ...]]:
+    """The faces (F, 3), turned so that the least number comes first."""
+    first = faces.argmin(axis=1)[:, None]
+    return {tuple(face) for face in np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).tolist()}
+
+
+def corners(garment: Garment) -> np.ndarray:
+    """Places (U, 3) at rest of the vertices of the flat pieces."""
+    places = np.empty((len(garment.uv), 3))
+    places[garment.uv_faces] = garment.rest_pos[garment.faces]
+    return places
+
+
 def test_a_garment_is_rebuilt(tmp_path: Path, body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SIZES, "", 1000)
     monkeypatch.delitem(SIZES, "_4k")
     monkeypatch.delitem(SIZES, "_12k")
     (path,) = build_wardrobe(tmp_path, ["poncho"])
     again, shipped = load_garment(path), load_garment("poncho")
-    np.testing.assert_array_equal(again.faces, shipped.faces)
-    np.testing.assert_allclose(again.uv, shipped.uv, atol=1e-5)
-    assert np.linalg.norm(again.rest_pos - shipped.rest_pos, axis=1).max() < 0.02
+    # Processors round differently, and number vertices in another order where two are as good.
+    apart, number = cKDTree(again.uv).query(shipped.uv)
+    assert len(again.uv) == len(shipped.uv) == len(set(number.tolist()))
+    assert apart.max() < 1e-5
+    assert triangles(again.uv_faces) == triangles(number[shipped.uv_faces])
+    places = [corners(garment) for garment in (again, shipped)]
+    assert np.linalg.norm(places[0][number] - places[1], axis=1).max() < 0.02
 
 
 def test_edges_are_as_long_as_the_number_of_vertices_asks(body: Body) -> None:
