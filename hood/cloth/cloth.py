@@ -183,9 +183,15 @@ class Cloth:
         """Mean length [m] of the edges at rest; 0 without edges."""
         return float(self.rest_edge_sq.double().sqrt().mean()) if len(self.edges) else 0.0
 
+    @cached_property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """The first and the second vertices (E,) of the edges, without gaps: such are gathered sooner."""
+        with torch.inference_mode(False):  # gradients may be asked for later
+            return self.edges[:, 0].contiguous(), self.edges[:, 1].contiguous()
+
     def edge_sq(self, pos: Tensor) -> Tensor:
         """Squares [m²] (E,) of the lengths of the edges at ``pos`` (V, 3) [m]."""
-        start, end = self.edges.unbind(dim=1)
+        start, end = self._ends
         return (pos.index_select(0, end) - pos.index_select(0, start)).square().sum(dim=1)
 
     def largest_of_edges(self, values: Tensor) -> Tensor:

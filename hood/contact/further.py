@@ -22,6 +22,7 @@ second contact, with which the step is taken to its end again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -90,6 +91,8 @@ def find_landing(
     length = way.norm(dim=1)
     far = (length > LEAST_WAY) & length.isfinite() & (contact.dist > -INSIDE) & (contact.dist - length < _NEAR)
     rows = far.nonzero().squeeze(1)
+    if not len(rows):
+        return None
     share = _first_touch(rows, pos, way, length, vertex_scene, obstacle, contact)
     rows = (share > 0.0).nonzero().squeeze(1)
     if not len(rows):
@@ -119,12 +122,14 @@ def _first_touch(
         if not len(rows):
             break
         whole = length[rows]
-        places = pos[rows] + (gone / whole).unsqueeze(1) * way[rows]
+        share = gone / whole
+        places = pos[rows] + share.unsqueeze(1) * way[rows]
         skin = match_surface(places, vertex_scene[rows], obstacle).dist
         plane = ((places - contact.point[rows]) * contact.normal[rows]).sum(dim=1)
         hidden = ~contact.valid[rows] | (plane - skin > HIDDEN)
         touches = (skin < _NEAR) & hidden
-        touched = touched.index_copy(0, rows, torch.where(touches, gone / whole, 0.0))
+        if bool(touches.any()):
+            touched = touched.index_copy(0, rows, torch.where(touches, share, 0.0))
         goes_on = ~touches & (skin < whole - gone + _NEAR) & (gone < whole)
         gone = (gone + skin.clamp_min(STRIDE)).minimum(whole)[goes_on]
         rows = rows[goes_on]
@@ -150,7 +155,10 @@ def find_entered(
     """
     if not len(obstacle.faces) or not len(pos):
         return None
-    depth = -signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+    dist = signed_distance(next_pos, cloth.vertex_scene, obstacle.next_pos, obstacle)
+    if float(dist.min()) >= -ENTERED_DEPTH:
+        return None
+    depth = -dist
     entered = cloth.free & (depth > ENTERED_DEPTH) & (depth < _DEEPEST)
     for contact in contacts:
         if not bool(entered.any()):
@@ -200,9 +208,12 @@ def hold_off(
     Args:
         scenes: (B,) bool, where that may be done; None for everywhere.
     """
+    cuts = _cut_faces(next_pos, cloth, obstacle)
+    if not cuts:
+        return None
     before = torch.zeros_like(contact.dist) if contact.raised is None else contact.raised
     rows = torch.zeros_like(contact.valid)
-    for cut in _cut_faces(next_pos, cloth, obstacle):
+    for cut in cuts:
         rows[cut.reshape(-1)] = True
     after = (2.0 * before + RISE).clamp_max(MOST)
     rows &= contact.valid & cloth.free & (before + 0.5 * RISE < MOST)
@@ -218,7 +229,7 @@ def num_in_skin(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> Tensor:
 
 def _cut_faces(next_pos: Tensor, cloth: Cloth, obstacle: Obstacle) -> list[Tensor]:
     """Corners (N, 3) of the triangles in the skin, of every scene that has more than :data:`CUT_SHARE`."""
-    if not bool(torch.isfinite(next_pos).all()):
+    if not math.isfinite(float(next_pos.sum())):
         return []
     found = _cut(next_pos, cloth, obstacle)
     return [faces[torch.as_tensor(cut, device=faces.device)] for faces, cut in found if len(cut) > CUT_SHARE * len(faces)]

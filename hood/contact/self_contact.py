@@ -133,11 +133,18 @@ class SceneLayers:
 
     def of(self, values: Tensor) -> np.ndarray:
         """This scene's rows of ``values`` (V, 3), float64."""
-        return values[self.first : self.last].detach().cpu().double().numpy()
+        own = values.detach()
+        own = own if self.last - self.first == len(own) else own[self.first : self.last]
+        return np.ascontiguousarray(own.cpu().numpy(), np.float64)
 
     def near_at_start(self, pos: Tensor) -> Contacts:
         """What is within its reach where the step begins, at ``pos`` (V, 3) m."""
         return self.layers.contacts(self.of(pos)) if self.at_start is None else self.at_start
+
+    def is_apart(self, pos: Tensor) -> bool:
+        """Whether nothing is within its reach at ``pos`` (V, 3) m; never where that is not finite."""
+        here = self.of(pos)
+        return bool(np.isfinite(here).all()) and not len(self.layers.contacts(here).corners)
 
     def begun_at(self, pos: Tensor) -> SceneLayers:
         """The same with ways that begin at ``pos`` (V, 3) m; what was near what where the step begins is still known."""
@@ -149,9 +156,9 @@ def find_layers(
 ) -> tuple[SceneLayers, ...]:
     """The layers of every scene at ``pos`` (V, 3), from where the step may lead to ``ahead`` (V, 3): targets of held vertices
     are in there, which may be out of reach (:func:`late_targets`). See :class:`hood.mesh.cloth_proximity.ClothSurface`."""
-    found = []
+    found, free, held_by = [], cloth.free.cpu().numpy(), cloth.pinned.cpu().numpy()
     for mesh, first, last in _meshes(cloth, reach):
-        fixed, pinned = (~cloth.free[first:last]).cpu().numpy(), cloth.pinned[first:last].cpu().numpy()
+        fixed, pinned = ~free[first:last], held_by[first:last]
         here, there = (values[first:last].detach().cpu().double().numpy() for values in (pos, ahead))
         held = bool(pinned.any() and np.isfinite(here).all() and np.isfinite(there[pinned]).all())
         there = np.where(np.isfinite(there), there, here)

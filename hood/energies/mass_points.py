@@ -21,7 +21,7 @@ class Gravity(Energy):
     form = Form.WEIGHT
 
     def applies(self, problem: StepProblem) -> bool:
-        return bool(problem.gravity.any())
+        return any(problem.gravity.tolist())  # three numbers: soonest on the host
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""

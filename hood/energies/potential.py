@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import is_
 from typing import Any
 
 import torch
@@ -16,8 +18,9 @@ from hood.energies.friction import CodedFriction, Friction, WeightFriction
 from hood.energies.mass_points import Attachment, Gravity, Inertia, SoftPins
 from hood.energies.membrane import Stretching
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem, sum_per_scene
-from hood.energies.term import NOT_INTERNAL, Energy, checked, kind_of, prepared
+from hood.energies.term import NOT_INTERNAL, checked, is_energy, kind_of, prepared
 from hood.energies.term import Term as Term
+from hood.tensors.batch import made_of
 
 
 class Potential:
@@ -55,9 +58,15 @@ class Potential:
 
         The problem itself where no term asks for more than it holds; contact that is there already is not searched again.
         """
-        for term in self.terms.values():
+        known, terms = made_of(problem).get("prepared"), tuple(self.terms.values())
+        values = [value for term in terms for value in (term, *getattr(term, "__dict__", {}).values())]
+        if known is not None and known[0]() is problem and len(known[1]) == len(values) and all(map(is_, known[1], values)):
+            return problem
+        for term in terms:
             problem = prepared(term, problem)
-        return self.with_internal_force(problem)
+        problem = self.with_internal_force(problem)
+        made_of(problem)["prepared"] = weakref.ref(problem), values
+        return problem
 
     @torch.no_grad()
     def with_internal_force(self, problem: StepProblem, compiled: bool = True) -> StepProblem:
@@ -148,13 +157,13 @@ def keeps_both_sides(potential: Potential) -> bool:
 
 
 def _counts_as_internal(term: Term, problem: StepProblem) -> bool:
-    if not isinstance(term, Energy):
+    if not is_energy(term):
         return True
     return not (term.role in NOT_INTERNAL or term.is_inactive(problem))
 
 
 def _needs_internal_force(term: Term, problem: StepProblem) -> bool:
-    return isinstance(term, Energy) and term.needs_internal_force(problem)
+    return is_energy(term) and term.needs_internal_force(problem)
 
 
 def default_potential(

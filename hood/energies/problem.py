@@ -208,8 +208,11 @@ class StepProblem:
 
     @property
     def vertex_dt(self) -> Tensor:
-        """Time step [s] of every vertex's scene, (V, 1)."""
-        return self.step.dt[self.cloth.vertex_scene].unsqueeze(1)
+        """Time step [s] of every vertex's scene, (V, 1); a view of one number where there is one scene, on a CPU."""
+        dt = self.step.dt
+        if self.num_scenes == 1 and dt.device.type == "cpu" and not dt.requires_grad:
+            return dt.expand(self.cloth.num_vertices, 1)
+        return dt[self.cloth.vertex_scene].unsqueeze(1)
 
     def acceleration(self, next_pos: Tensor) -> Tensor:
         """Accelerations [m/s²] (V, 3) that lead to ``next_pos`` (V, 3): (x - x_t - dt v_t) / dt².

@@ -351,8 +351,11 @@ class LayerBarrier(Energy):
 
     def is_inactive(self, problem: StepProblem) -> bool:
         """Whether no pair is within its reach at x_t."""
-        near = (len(scene.near_at_start(problem.state.pos).corners) for scene in problem.layers)
-        return bool(problem.layers) and not any(near)
+        return bool(problem.layers) and not any(len(scene.near_at_start(problem.state.pos).corners) for scene in problem.layers)
+
+    def is_zero(self, problem: StepProblem, pos: Tensor) -> bool:
+        """Whether no pair is within its reach at ``pos`` (V, 3); never where that is not finite."""
+        return all(scene.is_apart(pos) for scene in problem.layers)
 
     def __call__(self, problem: StepProblem, next_pos: Tensor, acc: Tensor) -> Tensor:
         """Energy [J] (B,) at ``next_pos`` (V, 3)."""
@@ -443,6 +446,5 @@ def for_networks(potential: Potential) -> Potential:
 
 
 def _without(potential: Potential, left_out: Mapping[str, Term]) -> Potential:
-    if not left_out:
-        return potential
-    return potential.only({name: term for name, term in potential.terms.items() if name not in left_out})
+    kept = {name: term for name, term in potential.terms.items() if name not in left_out}
+    return potential.only(kept) if left_out else potential

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeGuard, runtime_checkable
 
 from torch import Tensor
 
@@ -129,6 +129,10 @@ class Energy(ABC):
         """Whether it has no force at x_t, where that is sooner asked than computed."""
         return False
 
+    def is_zero(self, problem: StepProblem, pos: Tensor) -> bool:
+        """Whether energy and force are zero at ``pos`` (V, 3), where that is sooner asked than computed."""
+        return False
+
     def needs_internal_force(self, problem: StepProblem) -> bool:
         """Whether it reads :attr:`hood.energies.problem.StepProblem.internal_force`."""
         return False
@@ -170,19 +174,24 @@ class ContactRows(Protocol):
 Passes = Callable[["Contact"], ContactRows | None]
 
 
+def is_energy(term: Term) -> TypeGuard[Energy]:
+    """Whether a term is an :class:`Energy`; a step asks some hundred times, and ``isinstance`` is slow of abstract classes."""
+    return Energy in type(term).__mro__
+
+
 def role_of(term: Term) -> Role | None:
     """What an energy is for; None of one that does not say."""
-    return term.role if isinstance(term, Energy) else None
+    return term.role if is_energy(term) else None
 
 
 def form_of(term: Term) -> Form | None:
     """The kind of an energy's closed-form derivatives; None of one without."""
-    return term.form if isinstance(term, Energy) else None
+    return term.form if is_energy(term) else None
 
 
 def having(terms: Mapping[str, Term], *wanted: Role | Form) -> dict[str, Any]:
     """The terms, by name, that have one of some roles or forms."""
-    return {name: term for name, term in terms.items() if role_of(term) in wanted or form_of(term) in wanted}
+    return {name: term for name, term in terms.items() if is_energy(term) and (term.role in wanted or term.form in wanted)}
 
 
 def prepared(term: Term, problem: StepProblem) -> StepProblem:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,7 +38,7 @@ EASED = 0.1
 class _Mesh(ctypes.Structure):
     _fields_ = [
         *fields("num_vertices num_faces num_edges", COUNT),
-        *fields("faces edges face_vertex face_edge order piece reach vertex_area edge_area edge_length_sq", POINTER),
+        *fields("faces edges face_vertex face_edge order piece reach vertex_area edge_area edge_length_sq topology", POINTER),
     ]
 
 
@@ -52,7 +52,9 @@ def library() -> ctypes.CDLL:
     lib = build(_SOURCE, LAYER_FLAGS)
     lib.layers_make.restype = POINTER
     lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
-    lib.layers_free.argtypes = [POINTER]
+    lib.layers_topology.restype = POINTER
+    for name in ("topology", "topology_free", "free"):
+        getattr(lib, f"layers_{name}").argtypes = [POINTER]
     lib.layers_crossed.argtypes = [POINTER]
     lib.layers_pressing.argtypes = [POINTER, POINTER]
     lib.layers_approach.argtypes = [POINTER, POINTER, REAL]
@@ -126,15 +128,27 @@ class LayerMesh:
         self.apart: _Apart | None = None  # where a step has ended lately
         self.num_vertices, self.reach = len(rest), self._arrays["reach"]  # (V,) m
         counts = len(rest), len(faces), len(edges)
-        self.structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
+        self._structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
+
+    @cached_property
+    def address(self) -> int:
+        """Of the structure that the compiled search reads, as long as this lives."""
+        lib, address = library(), ctypes.addressof(self._structure)
+        topology = lib.layers_topology(address)
+        weakref.finalize(self, lib.layers_topology_free, topology)
+        self._structure.topology = topology
+        return address
 
     def known_apart(self, pos: np.ndarray, held: np.ndarray, between: bool) -> bool:
         """Whether ``pos`` (V, 3) are the positions :attr:`apart`, moved as a whole."""
         known = self.apart
-        if known is None or known.between != between or not np.isfinite(pos).all() or not np.array_equal(known.held, held):
+        if known is None or known.between != between or not np.array_equal(known.held, held):
             return False
-        shift = pos - known.pos
-        return bool(np.abs(shift - shift.mean(axis=0)).max(initial=0.0) < 0.1 * SPARE)
+        if np.array_equal(pos, known.pos):
+            return True
+        with np.errstate(invalid="ignore"):  # no number is less
+            shift = pos - known.pos
+            return bool(np.abs(shift - shift.mean(axis=0)).max(initial=0.0) < 0.1 * SPARE)
 
 
 def vertex_room(rest: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -180,6 +194,9 @@ class Contacts:
     reach: np.ndarray  # (N,) m
     area: np.ndarray  # (N,) m² at rest that the pair stands for
     parallel: np.ndarray  # (N,) m⁴, square of the edges' cross product below which their barrier fades; 0 for others
+
+
+_NO_CONTACTS = Contacts(np.empty((0, 4), np.int64), np.empty(0, bool), np.empty((0, 4)), *np.empty((3, 0)))
 
 
 class Work(NamedTuple):
@@ -231,9 +248,10 @@ class ClothSurface:
         given = (start.ctypes.data, end.ctypes.data, held.ctypes.data, margin.ctypes.data)
         self._apart = mesh.known_apart(start, held, between)
         rules = pressure, int(between), int(self._apart)
-        self.handle = self._lib.layers_make(ctypes.byref(mesh.structure), *given, *rules)
+        self.handle = self._lib.layers_make(mesh.address, *given, *rules)
         weakref.finalize(self, self._lib.layers_free, self.handle)
         self._held, self.between = held, between
+        self._found: tuple[np.ndarray, Contacts] | None = None  # positions that were asked about last, and their pairs
         self.forced = 0  # pairs of features that held vertices drive through each other
 
     def begun_at(self, pos: np.ndarray) -> ClothSurface:
@@ -247,6 +265,7 @@ class ClothSurface:
 
     def restart(self) -> None:
         """Forget what has been asked so far: what comes next does not depend on it, to the bit."""
+        self._found = None
         self._lib.layers_restart(self.handle)
 
     def remember_apart(self, pos: np.ndarray) -> None:
@@ -262,7 +281,7 @@ class ClothSurface:
         others are taken as near as can be from where :meth:`resort_to` says. Pairs that cannot make room even so are left out
         and counted in ``forced``.
         """
-        there = _positions(target).copy()
+        there, self._found = _positions(target).copy(), None
         self.forced += int(self._lib.layers_approach(self.handle, there.ctypes.data, LEFT))
         return there
 
@@ -313,7 +332,14 @@ class ClothSurface:
     def contacts(self, pos: np.ndarray) -> Contacts:
         """All pairs within their reach at ``pos`` (V, 3)."""
         here = _positions(pos)
+        if self._found is None or not np.array_equal(self._found[0], here):
+            self._found = here.copy(), self._contacts(here)
+        return self._found[1]
+
+    def _contacts(self, here: np.ndarray) -> Contacts:
         count = int(self._lib.layers_model(self.handle, here.ctypes.data))
+        if not count:
+            return _NO_CONTACTS
         corners, edges = np.empty((count, 4), np.int64), np.empty(count, np.int64)
         weights, constants = np.empty((count, 4)), np.empty((count, 3))
         self._lib.layers_contacts(self.handle, *(array.ctypes.data for array in (corners, edges, weights, constants)))
@@ -322,7 +348,7 @@ class ClothSurface:
     def model(self, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Gradient (V, 3) [N] at ``pos`` (V, 3), and its curvature: the sum of n nᵀ over rows n (N, 4, 3) of the vertices
         (N, 4), diagonal blocks of which are (V, 6) upper triangles."""
-        found = self.contacts(pos)
+        found = self._contacts(_positions(pos))
         gradient, own = np.empty((self.mesh.num_vertices, 3)), np.empty((self.mesh.num_vertices, 6))
         rows = np.empty((len(found.corners), 4, 3))
         self._lib.layers_forces(self.handle, gradient.ctypes.data, own.ctypes.data)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
+import numpy as np
 import torch
 
 POINTER, COUNT, REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
@@ -16,6 +17,15 @@ POINTER, COUNT, REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 def fields(text: str, kind: type) -> list[tuple[str, type]]:
     """Entries of ``_fields_`` of one type, from their names with spaces between."""
     return [(name, kind) for name in text.split()]
+
+
+_BYTES = ctypes.c_char * 0
+
+
+def address_of(array: np.ndarray) -> int:
+    """Of the first number of an array that may be written to and has no gaps (TypeError); ``array.ctypes.data`` takes 1.6 µs,
+    this 0.6, and a step asks a hundred times."""
+    return ctypes.addressof(_BYTES.from_buffer(array))  # type: ignore[arg-type]
 
 
 SOURCE = Path(__file__).with_name("threads.h")

@@ -5,8 +5,10 @@
 // as cloth that rests.
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "lanes.h"
@@ -31,9 +33,20 @@ inline bool any(AxesTest test) {
 #endif
 }
 
+#if defined(__AVX__)
+// Bits of the axes along which values are greater at both ends.
+inline unsigned greater(const Axes* a, const Axes* b) {
+    typedef float BothEnds __attribute__((vector_size(32)));
+    const unsigned both = (unsigned)__builtin_ia32_movmskps256((BothEnds)(load<BothEnds>(a) > load<BothEnds>(b)));
+    return both & both >> 4;
+}
+
+inline bool overlap(const MovingBox& a, const MovingBox& b) { return !(greater(a.low, b.high) | greater(b.low, a.high)); }
+#else
 inline bool overlap(const MovingBox& a, const MovingBox& b) {
     return !any(((a.low[0] > b.high[0]) & (a.low[1] > b.high[1])) | ((b.low[0] > a.high[0]) & (b.low[1] > a.high[1])));
 }
+#endif
 
 inline void join(MovingBox& box, const MovingBox& other) {
     for (int end = 0; end < 2; ++end) {
@@ -41,6 +54,8 @@ inline void join(MovingBox& box, const MovingBox& other) {
         box.high[end] = other.high[end] > box.high[end] ? other.high[end] : box.high[end];
     }
 }
+
+struct LayerTopology;
 
 // What is constant as long as the cloth; arrays of the caller.
 struct LayerMesh {
@@ -51,12 +66,46 @@ struct LayerMesh {
     const double *reach;                          // (V) m, distance at which a vertex is near others
     const double *vertex_area, *edge_area;        // (V), (E) m^2 at rest
     const double *edge_length_sq;                 // (E) m^2 at rest
+    const LayerTopology* topology;                // of these faces, see layers_topology
 };
 
-// Features that the faces answer for, in the order of the faces, with their boxes.
+constexpr int64_t LEAF = 4;  // faces
+
+// Whether the tree halves the first of two ranges of faces, one of which is no leaf, or the other one.
+inline bool halves_first(int64_t count, int64_t other) { return other <= LEAF || (count > LEAF && count >= other); }
+
+// A number of two faces, by their places i < j, in the order in which the tree visits pairs of faces.
+inline uint64_t rank_of(int64_t num_faces, int64_t i, int64_t j) {
+    uint64_t rank = 0;
+    int at = 64;
+    const auto append = [&](int bits, int64_t value) { rank |= (uint64_t)value << (at -= bits); };
+    int64_t begin = 0, end = num_faces;
+    while (end - begin > LEAF) {
+        const int64_t middle = (begin + end) / 2;
+        if (j < middle) {
+            append(2, 0), end = middle;
+        } else if (i >= middle) {
+            append(2, 1), begin = middle;
+        } else {
+            append(2, 2);
+            int64_t first[2] = {begin, middle}, second[2] = {middle, end};
+            while (first[1] - first[0] > LEAF || second[1] - second[0] > LEAF) {
+                const bool halved = halves_first(first[1] - first[0], second[1] - second[0]);
+                int64_t* range = halved ? first : second;
+                const int64_t half = (range[0] + range[1]) / 2, place = halved ? i : j;
+                append(1, place >= half), range[place < half] = half;
+            }
+            append(2, i - first[0]), append(2, j - second[0]);
+            return rank;
+        }
+    }
+    append(2, i - begin), append(2, j - begin);
+    return rank;
+}
+
+// Features that the faces answer for, in the order of the faces.
 struct OwnFeatures {
     std::vector<int32_t> starts, number;  // (F + 1), and what feature it is
-    std::vector<MovingBox> box;
 
     void list(const int32_t* owned, const int32_t* order, int64_t num_faces) {
         starts.assign(1, 0), number.clear();
@@ -65,18 +114,81 @@ struct OwnFeatures {
             for (int c = 0; c < 3 && own[c] >= 0; ++c) number.push_back(own[c]);
             starts.push_back((int32_t)number.size());
         }
-        box.resize(number.size());
+    }
+};
+
+// A vertex and a face, or two edges, and the places of the faces that were looked at for them.
+struct Candidate {
+    int32_t first, second, faces[2];
+};
+
+// What the search knows of the faces whatever their positions are: boxes of most pairs of faces that overlap belong to faces with a
+// common vertex, of which the features that may be near each other are always the same. All by places in the order.
+struct LayerTopology {
+    OwnFeatures vertices, edges;
+    std::vector<std::array<int32_t, 3>> corners;  // (F)
+    std::vector<std::array<int32_t, 3>> links;    // (F) the same; vertices of more than MOST_AROUND faces are negative, no two alike
+    // Of faces with a common vertex of few faces, as the tree visits them: pairs of features without one, by the places of their boxes.
+    std::vector<Candidate> beside[2];
+    std::vector<std::array<int32_t, 2>> boxes[2];
+
+    static constexpr size_t MOST_AROUND = 64;  // pairs of faces at a vertex are as many as its square
+
+    explicit LayerTopology(const LayerMesh& mesh) : corners(mesh.num_faces), links(mesh.num_faces) {
+        vertices.list(mesh.face_vertex, mesh.order, mesh.num_faces), edges.list(mesh.face_edge, mesh.order, mesh.num_faces);
+        std::vector<std::vector<int32_t>> around(mesh.num_vertices);
+        for (int64_t i = 0; i < mesh.num_faces; ++i)
+            for (int c = 0; c < 3; ++c) around[corners[i][c] = mesh.faces[3 * (int64_t)mesh.order[i] + c]].push_back((int32_t)i);
+        std::vector<std::pair<uint64_t, std::array<int32_t, 2>>> both;
+        for (int64_t i = 0; i < mesh.num_faces; ++i)
+            for (int c = 0; c < 3; ++c) links[i][c] = around[corners[i][c]].size() > MOST_AROUND ? (int32_t)(-3 * i - c - 1) : corners[i][c];
+        for (int64_t i = 0; i < mesh.num_faces; ++i)
+            for (int32_t v : links[i])
+                for (size_t k = 0; v >= 0 && k < around[v].size(); ++k)
+                    if (const int32_t j = around[v][k]; i < j) both.push_back({rank_of(mesh.num_faces, i, j), {(int32_t)i, j}});
+        std::sort(both.begin(), both.end());
+        both.erase(std::unique(both.begin(), both.end()), both.end());
+        for (const auto& [rank, faces] : both) list(mesh, faces[0], faces[1]);
+    }
+
+    // Whether two faces have such a vertex in common.
+    bool meet(int64_t i, int64_t j) const {
+        const std::array<int32_t, 3>&a = links[i], &b = links[j];
+        return (a[0] == b[0]) | (a[0] == b[1]) | (a[0] == b[2]) | (a[1] == b[0]) | (a[1] == b[1]) | (a[1] == b[2]) | (a[2] == b[0]) |
+               (a[2] == b[1]) | (a[2] == b[2]);
+    }
+
+    bool holds(int64_t face, int32_t v) const { return (v == corners[face][0]) | (v == corners[face][1]) | (v == corners[face][2]); }
+
+    static bool meet(const LayerMesh& mesh, int32_t a, int32_t b) {
+        const int32_t *one = mesh.edges + 2 * (int64_t)a, *two = mesh.edges + 2 * (int64_t)b;
+        return (one[0] == two[0]) | (one[0] == two[1]) | (one[1] == two[0]) | (one[1] == two[1]);
+    }
+
+    void list(const LayerMesh& mesh, int32_t i, int32_t j) {
+        for (int32_t face : {i, j}) {
+            const int32_t other = face == i ? j : i;
+            for (int32_t p = vertices.starts[face]; p < vertices.starts[face + 1]; ++p)
+                if (!holds(other, vertices.number[p])) {
+                    beside[0].push_back({vertices.number[p], mesh.order[other], {i, j}});
+                    boxes[0].push_back({p, other});
+                }
+        }
+        for (int32_t p = edges.starts[i]; p < edges.starts[i + 1]; ++p)
+            for (int32_t q = edges.starts[j]; q < edges.starts[j + 1]; ++q) {
+                const int32_t a = edges.number[p], b = edges.number[q];
+                if (meet(mesh, a, b)) continue;
+                beside[1].push_back({std::min(a, b), std::max(a, b), {i, j}});
+                boxes[1].push_back({p, q});
+            }
     }
 };
 
 // All of a face's neighbours in the tree are told by its place in the order.
 struct LayerTree {
     std::vector<MovingBox> vertex, face, node;
-    OwnFeatures vertices, edges;
+    std::vector<MovingBox> own_vertex, own_edge;  // of the topology's features
     int64_t num_faces = 0;
-    const int32_t* starts_of = nullptr;  // the order that features are listed in
-
-    static constexpr int64_t LEAF = 4;
 
     // Boxes of vertices on their ways, so much wider on all sides; ``wide`` by vertex, and what the rounding of positions asks for.
     void enclose(const double* from, const double* to, const std::vector<double>& wide) {
@@ -101,19 +213,17 @@ struct LayerTree {
 
     void build(const LayerMesh& mesh) {
         num_faces = mesh.num_faces;
-        if (starts_of != mesh.order) {
-            vertices.list(mesh.face_vertex, mesh.order, num_faces), edges.list(mesh.face_edge, mesh.order, num_faces);
-            starts_of = mesh.order;
-        }
-        for (size_t i = 0; i < vertices.number.size(); ++i) vertices.box[i] = vertex[vertices.number[i]];
-        for (size_t i = 0; i < edges.number.size(); ++i) {
-            const int32_t* ends = mesh.edges + 2 * (int64_t)edges.number[i];
-            edges.box[i] = vertex[ends[0]];
-            join(edges.box[i], vertex[ends[1]]);
+        const std::vector<int32_t>&vertices = mesh.topology->vertices.number, &edges = mesh.topology->edges.number;
+        own_vertex.resize(vertices.size()), own_edge.resize(edges.size());
+        for (size_t i = 0; i < vertices.size(); ++i) own_vertex[i] = vertex[vertices[i]];
+        for (size_t i = 0; i < edges.size(); ++i) {
+            const int32_t* ends = mesh.edges + 2 * (int64_t)edges[i];
+            own_edge[i] = vertex[ends[0]];
+            join(own_edge[i], vertex[ends[1]]);
         }
         face.resize(num_faces);
         for (int64_t i = 0; i < num_faces; ++i) {
-            const int32_t* corner = mesh.faces + 3 * (int64_t)mesh.order[i];
+            const std::array<int32_t, 3>& corner = mesh.topology->corners[i];
             face[i] = vertex[corner[0]];
             join(face[i], vertex[corner[1]]), join(face[i], vertex[corner[2]]);
         }
@@ -178,7 +288,7 @@ struct LayerTree {
                 for (int64_t j = b0; j < b1; ++j)
                     if (overlap(face[i], face[j])) visit(i, j);
             }
-        } else if (leaf_b || (!leaf_a && a1 - a0 >= b1 - b0)) {
+        } else if (halves_first(a1 - a0, b1 - b0)) {
             const int64_t middle = (a0 + a1) / 2;
             between(2 * a + 1, a0, middle, b, b0, b1, visit);
             between(2 * a + 2, middle, a1, b, b0, b1, visit);

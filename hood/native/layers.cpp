@@ -21,6 +21,11 @@ void* layers_make(const void* mesh, const double* pos, const double* ahead, cons
 
 void layers_free(void* layers) { delete (Layers*)layers; }
 
+// What searches know of the faces of a mesh, which its ``topology`` has to point to.
+void* layers_topology(const void* mesh) { return new LayerTopology(*(const LayerMesh*)mesh); }
+
+void layers_topology_free(void* topology) { delete (LayerTopology*)topology; }
+
 // Pairs of faces that pass through each other where the step begins.
 int64_t layers_crossed(void* handle) {
     Layers* layers = (Layers*)handle;

@@ -108,22 +108,20 @@ struct Layers {
     int64_t searches = 0, refreshes = 0, crossed = 0;  // pairs of faces that are crossed where it begins
     LayerClock clock;  // what solvers do with the rows is no part of it
     bool overflowed = false;  // cloth so crumpled, or torn, that nearly everything is near everything: no list
-    struct Candidate {
-        int32_t first, second;  // a vertex and a face, or two edges
-    };
     // Pairs whose boxes overlap; written without a branch, which would be guessed wrongly as often as not.
     struct Candidates {
         std::vector<Candidate> list;
         size_t count = 0;
 
-        void offer(int32_t first, int32_t second, bool taken) {
-            list[count] = {first, second};
+        void offer(const Candidate& pair, bool taken) {
+            list[count] = pair;
             count += taken;
         }
         void make_room(size_t more) {
             if (list.size() < count + more) list.resize(2 * (count + more));
         }
-    } candidates[2];
+    } candidates[2], beside[2];  // the latter of faces with a common vertex
+    std::vector<std::array<int32_t, 2>> found_at;  // places of the faces of the pairs that the last search has found of a kind
     std::vector<double> wide;
     std::vector<int32_t> strays;
     // For the solver.
@@ -217,42 +215,76 @@ struct Layers {
     // Adds pairs of features of the pairs of faces that are visited; where ``stray`` is given, only those with such a vertex.
     template <class Faces> void fill(const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
         int64_t looked_at = 0;
-        for (Candidates& some : candidates) some.count = 0;
+        for (int edges = 0; edges < 2; ++edges) candidates[edges].count = beside[edges].count = 0;
+        const LayerTopology& topology = *mesh.topology;
+        if (!stray) list_beside();
         const auto too_many = [&] {
-            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)(candidates[0].count + candidates[1].count) > MOST_PAIRS;
+            const size_t count = candidates[0].count + candidates[1].count + beside[0].count + beside[1].count;
+            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)count > MOST_PAIRS;
         };
-        const OwnFeatures &vertices = tree.vertices, &edges = tree.edges;
+        const OwnFeatures &vertices = topology.vertices, &edges = topology.edges;
         visit([&](int64_t i, int64_t j) {
             if (too_many()) return;
             ++looked_at;
+            if (!stray && topology.meet(i, j)) return;
             if (first && crossed_faces(mesh.order[i], mesh.order[j], from.data())) ++crossed, release_faces(mesh.order[i], mesh.order[j]);
             candidates[0].make_room(6), candidates[1].make_room(9);
-            for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j);
-            for (int32_t v = vertices.starts[j]; v < vertices.starts[j + 1]; ++v) consider_vertex(v, i);
+            for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j, i, j);
+            for (int32_t v = vertices.starts[j]; v < vertices.starts[j + 1]; ++v) consider_vertex(v, i, i, j);
             for (int32_t a = edges.starts[i]; a < edges.starts[i + 1]; ++a)
-                for (int32_t b = edges.starts[j]; b < edges.starts[j + 1]; ++b) consider_edges(a, b);
+                for (int32_t b = edges.starts[j]; b < edges.starts[j + 1]; ++b) consider_edges(a, b, i, j);
         });
         overflowed = too_many();
         if (overflowed) return;
         if (first) std::sort(released.begin(), released.end());
-        for (int edges = 0; edges < 2; ++edges)
-            for (size_t i = 0; i < candidates[edges].count; i += AT_ONCE) measure(edges, i, stray);
+        for (int edges = 0; edges < 2; ++edges) {
+            const size_t before = pairs.size();
+            found_at.clear();
+            for (size_t i = 0; i < candidates[edges].count; i += AT_ONCE) measure(edges, candidates[edges], i, stray);
+            const size_t apart = pairs.size();
+            for (size_t i = 0; i < beside[edges].count; i += AT_ONCE) measure(edges, beside[edges], i, stray);
+            if (before < apart && apart < pairs.size()) merge(before, apart);
+        }
+    }
+
+    // Pairs of faces with a common vertex whose boxes overlap.
+    void list_beside() {
+        for (int edges = 0; edges < 2; ++edges) {
+            const std::vector<MovingBox>&one = edges ? tree.own_edge : tree.own_vertex, &other = edges ? tree.own_edge : tree.face;
+            const std::vector<Candidate>& known = mesh.topology->beside[edges];
+            const std::vector<std::array<int32_t, 2>>& boxes = mesh.topology->boxes[edges];
+            if (beside[edges].list.size() <= known.size()) beside[edges].list.resize(known.size() + 1);
+            for (size_t i = 0; i < known.size(); ++i) beside[edges].offer(known[i], overlap(one[boxes[i][0]], other[boxes[i][1]]));
+        }
+    }
+
+    // The pairs from ``apart`` on go among those from ``before`` on, in the order in which the tree visits their faces: that of sums.
+    void merge(size_t before, size_t apart) {
+        std::vector<std::pair<uint64_t, size_t>> order;
+        for (size_t i = before; i < pairs.size(); ++i)
+            order.push_back({rank_of(mesh.num_faces, found_at[i - before][0], found_at[i - before][1]), i});
+        std::inplace_merge(order.begin(), order.begin() + (apart - before), order.end(), [](const auto& a, const auto& b) { return a.first < b.first; });
+        const auto sorted = [&](auto& values) {
+            auto moved = values;
+            for (size_t i = before; i < values.size(); ++i) moved[i] = values[order[i - before].second];
+            values.swap(moved);
+        };
+        sorted(pairs), sorted(keys), sorted(bounds);
     }
 
     const int32_t* corners_at(int64_t place) const { return mesh.faces + 3 * (int64_t)mesh.order[place]; }
 
-    // Features by their places in the tree.
-    void consider_vertex(int32_t place, int64_t at_face) {
-        const int32_t v = tree.vertices.number[place], *face = corners_at(at_face);
-        const bool shared = (v == face[0]) | (v == face[1]) | (v == face[2]);
-        candidates[0].offer(v, mesh.order[at_face], overlap(tree.vertices.box[place], tree.face[at_face]) & !shared);
+    // Features by their places in the tree, of the faces i and j.
+    void consider_vertex(int32_t place, int64_t at_face, int64_t i, int64_t j) {
+        const int32_t v = mesh.topology->vertices.number[place];
+        const bool near = overlap(tree.own_vertex[place], tree.face[at_face]) & !mesh.topology->holds(at_face, v);
+        candidates[0].offer({v, mesh.order[at_face], {(int32_t)i, (int32_t)j}}, near);
     }
 
-    void consider_edges(int32_t place, int32_t other) {
-        const int32_t a = tree.edges.number[place], b = tree.edges.number[other];
-        const int32_t *one = mesh.edges + 2 * (int64_t)a, *two = mesh.edges + 2 * (int64_t)b;
-        const bool shared = (one[0] == two[0]) | (one[0] == two[1]) | (one[1] == two[0]) | (one[1] == two[1]);
-        candidates[1].offer(std::min(a, b), std::max(a, b), overlap(tree.edges.box[place], tree.edges.box[other]) & !shared);
+    void consider_edges(int32_t place, int32_t other, int64_t i, int64_t j) {
+        const int32_t a = mesh.topology->edges.number[place], b = mesh.topology->edges.number[other];
+        const bool near = overlap(tree.own_edge[place], tree.own_edge[other]) & !LayerTopology::meet(mesh, a, b);
+        candidates[1].offer({std::min(a, b), std::max(a, b), {(int32_t)i, (int32_t)j}}, near);
     }
 
     void corners_of(int edges, Candidate pair, int32_t* corner) const {
@@ -264,9 +296,9 @@ struct Layers {
 
     // Adds those of the next candidates to the list that can come within their reach: by the distance halfway, less what the
     // features move towards each other from there and what they may be off their ways.
-    void measure(int edges, size_t begin, const std::vector<uint8_t>* stray) {
-        const std::vector<Candidate>& list = candidates[edges].list;
-        const int count = (int)std::min<size_t>(AT_ONCE, candidates[edges].count - begin), split = edges ? 2 : 1;
+    void measure(int edges, const Candidates& given, size_t begin, const std::vector<uint8_t>* stray) {
+        const std::vector<Candidate>& list = given.list;
+        const int count = (int)std::min<size_t>(AT_ONCE, given.count - begin), split = edges ? 2 : 1;
         int32_t corner[AT_ONCE][4];
         alignas(64) double middle[4][3][AT_ONCE], half[4][3][AT_ONCE];
         for (int lane = 0; lane < AT_ONCE; ++lane) {
@@ -318,6 +350,7 @@ struct Layers {
             pair.parallel = 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b];
         }
         pairs.push_back(pair), keys.push_back(k), bounds.push_back(bound);
+        found_at.push_back({found.faces[0], found.faces[1]});
     }
 
     bool is_released(uint64_t k) const { return !released.empty() && std::binary_search(released.begin(), released.end(), k); }

@@ -11,7 +11,9 @@ Why a minimisation ended, as words in a report and as numbers in a rollout's met
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,6 +25,7 @@ from hood.energies import compiled_elements
 from hood.energies.compiled_elements import absolute_strain
 from hood.energies.potential import Potential
 from hood.energies.problem import STANDARD_GRAVITY, StepProblem
+from hood.energies.term import is_energy
 from hood.solver.derivatives import compiled_vertices, vertices
 
 #: A vertex deeper than this [m] inside the body counts as penetrating.
@@ -64,7 +67,22 @@ def edge_strain(cloth: Cloth, pos: Tensor) -> Tensor:
 
 def strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
     """Median, 99th percentile and maximum of the absolute edge strain; NaN where ``pos`` (V, 3) is not finite, and
-    without edges."""
+    without edges. Of the same positions it is computed once: a step ends where the next one begins."""
+    if pos.device.type != "cpu":
+        return _strain_metrics(cloth, pos)
+    last, here = _LAST_STRAIN[0] if _LAST_STRAIN else None, pos.detach()
+    if last is not None and last[0]() is cloth and last[1].dtype == here.dtype and torch.equal(last[1], here):
+        return dict(last[2])
+    found = _strain_metrics(cloth, pos)
+    _LAST_STRAIN[:] = [(weakref.ref(cloth), here.clone(), found)]
+    return dict(found)
+
+
+#: Cloth and positions that metrics were asked for last, and the metrics.
+_LAST_STRAIN: list[tuple[weakref.ref[Cloth], Tensor, dict[str, float]]] = []
+
+
+def _strain_metrics(cloth: Cloth, pos: Tensor) -> dict[str, float]:
     strain, gathered = absolute_strain(cloth, pos), cloth.gathered_edges
     if strain is None:
         strain = cloth.edge_strain(pos).abs().double().cpu().numpy()
@@ -187,7 +205,7 @@ class StepFigures:
         result["e0"] = 0.5 * float(mass.sum()) * (self._gravity * dt) ** 2
         return result
 
-    @property
+    @cached_property
     @np.errstate(all="ignore")
     def relative_gradient(self) -> float:
         """rg alone: the force left over as a share of the weight."""
@@ -195,7 +213,7 @@ class StepFigures:
         weight_sq = self._gravity**2 * float(moving @ moving)
         return float(np.sqrt(self._forces_sq.sum() / weight_sq)) if weight_sq > 0 else 0.0
 
-    @property
+    @cached_property
     def _forces_sq(self) -> np.ndarray:
         """(N,) N², ‖∂Φ/∂x_v‖² of the free vertices."""
         slope = compiled_elements.as_double(self.gradient)
@@ -205,7 +223,7 @@ class StepFigures:
     def _free(self) -> np.ndarray:
         return np.asarray(self._problem.cloth.free.cpu().numpy())
 
-    @property
+    @cached_property
     def _gravity(self) -> float:
         return float(np.linalg.norm(compiled_elements.as_double(self._problem.gravity))) or STANDARD_GRAVITY
 
@@ -242,6 +260,12 @@ class StepFigures:
         if not others.active(problem):
             return energies
         place, given = (torch.from_numpy(values).to(problem.state.pos) for values in (pos, acc))
+        zero = {name: term for name, term in others.terms.items() if is_energy(term) and term.is_zero(problem, place)}
+        if zero:  # a gradient by autograd takes as long as all other terms
+            energies |= dict.fromkeys(zero, 0.0)
+            others = others.only({name: term for name, term in others.terms.items() if name not in zero})
+        if not others.active(problem):
+            return energies
         if gradient is None:
             return energies | {name: float(value) for name, value in others.energies(problem, place, given).items()}
         slope, parts_of_rest = others.gradient(problem, place, given)

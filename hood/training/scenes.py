@@ -178,7 +178,7 @@ class SceneSampler:
         motion = window.scene.motion
         assert isinstance(motion, BodyMotion)
         return {
-            "cloth": {name: _to_numpy(value) for name, value in vars(window.scene.cloth).items()},
+            "cloth": {field.name: _to_numpy(getattr(window.scene.cloth, field.name)) for field in fields(Cloth)},
             "sequence": motion.sequence,
             "betas": motion.betas,
             "surfaces": {chunk: surface.numpy() for chunk, surface in motion.surfaces().items()},

@@ -159,3 +159,13 @@ def test_time_steps_that_are_none_are_refused() -> None:
     problem = make_problem(build_cloth(SQUARE, HALVES, Material()))
     with pytest.raises(ValueError, match="dt has 2 entries for 1 scenes"):
         replace(problem, step=StepInput(dt=torch.full((2,), 1 / 30)))
+
+
+def test_edges_that_were_first_asked_for_without_gradients_can_be_followed_later() -> None:
+    pos, faces = grid(3, 3, 0.1)
+    cloth = build_cloth(pos, faces, Material())
+    with torch.inference_mode():
+        cloth.edge_sq(cloth.rest_pos)
+    here = cloth.rest_pos.clone().requires_grad_()
+    cloth.edge_sq(here).sum().backward()
+    assert here.grad is not None

@@ -153,6 +153,8 @@ def test_layers_pull_where_they_are_near(gap: float, rests: bool) -> None:
     assert term.is_inactive(prepared) == rests
     _, gradient = _alone(term, prepared, near.state.pos)
     assert bool((gradient == 0.0).all()) == rests
+    assert term.is_zero(prepared, near.state.pos) == rests
+    assert not term.is_zero(prepared, torch.full_like(near.state.pos, torch.nan))
     with pytest.raises(ValueError, match="layers not searched for yet"):
         Potential({"layers": term}).energies(near, near.state.pos)
     assert not term.is_inactive(near)

@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -178,3 +179,38 @@ def _to(item, dtype):
     values = {name: getattr(item, name) for name in item.__dataclass_fields__}
     real = {n: v.to(dtype) for n, v in values.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
     return replace(item, **real)
+
+
+def test_a_prepared_problem_is_not_prepared_again():
+    asked = []
+
+    class Asking(Collision):
+        def prepare(self, problem):
+            asked.append(problem)
+            return super().prepare(problem)
+
+    pos, faces = grid(4, 4, 0.1)
+    problem = make_problem(build_cloth(pos, faces, Material()), pos)
+    potential = default_potential().with_terms(collision=Asking())
+    prepared = potential.prepare(problem)
+    assert potential.prepare(prepared) is prepared
+    assert len(asked) == 1
+    potential.with_terms(collision=Asking()).prepare(prepared)  # other terms may ask for more
+    potential.prepare(replace(prepared))
+    assert len(asked) == 3
+    assert potential.prepare(copy.copy(prepared)) is not prepared  # fixed shapes copy problems so
+    assert len(asked) == 4
+    potential.prepare(prepared)
+    potential.terms["collision"].epsilon = 4e-3
+    potential.prepare(prepared)
+    assert len(asked) == 6
+
+
+def test_time_steps_of_vertices_are_those_of_their_scene():
+    pos, faces = grid(3, 3, 0.1)
+    cloth = build_cloth(pos, faces, Material())
+    single = make_problem(cloth, pos)
+    assert torch.equal(single.vertex_dt, single.step.dt[cloth.vertex_scene].unsqueeze(1))
+    dt = single.step.dt.clone().requires_grad_()
+    followed = replace(single, step=replace(single.step, dt=dt))
+    assert followed.vertex_dt.requires_grad

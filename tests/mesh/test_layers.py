@@ -267,3 +267,83 @@ def test_positions_that_are_not_finite_end_the_search() -> None:
     layers = _layers(mesh, broken)
     assert len(layers.contacts(broken).corners) == 0
     assert layers.work.overflowed
+
+
+def _visited(num_faces: int) -> list[tuple[int, int]]:
+    """Pairs of places in the order in which the tree visits faces: halves down to four, each in itself, then both."""
+
+    def within(begin: int, end: int) -> list[tuple[int, int]]:
+        if end - begin <= 4:
+            return [(i, j) for i in range(begin, end) for j in range(i + 1, end)]
+        middle = (begin + end) // 2
+        return within(begin, middle) + within(middle, end) + between((begin, middle), (middle, end))
+
+    def between(a: tuple[int, int], b: tuple[int, int]) -> list[tuple[int, int]]:
+        one, other = a[1] - a[0], b[1] - b[0]
+        if max(one, other) <= 4:
+            return [(i, j) for i in range(*a) for j in range(*b)]
+        if other <= 4 or (one > 4 and one >= other):
+            middle = sum(a) // 2
+            return between((a[0], middle), b) + between((middle, a[1]), b)
+        middle = sum(b) // 2
+        return between(a, (b[0], middle)) + between(a, (middle, b[1]))
+
+    return within(0, num_faces)
+
+
+def test_sums_run_in_the_order_of_the_tree_however_a_pair_was_found() -> None:
+    """Pairs of faces with a common vertex are known beforehand; sums over all pairs keep their order, and so their bits."""
+    mesh, pos, _ = _sheets(7)
+    crumpled = 0.3 * pos + 6e-3 * np.random.default_rng(5).normal(size=pos.shape)
+    found = _layers(mesh, pos).contacts(crumpled)
+    place = np.argsort(mesh._arrays["order"])
+    of_vertex, of_edge = (
+        {int(one): int(place[face]) for face, row in enumerate(mesh._arrays[name]) for one in row if one >= 0}
+        for name in ("face_vertex", "face_edge")
+    )
+    faces = {tuple(sorted(face)): int(place[number]) for number, face in enumerate(mesh._arrays["faces"].tolist())}
+    edges = {tuple(sorted(edge)): of_edge[number] for number, edge in enumerate(mesh._arrays["edges"].tolist())}
+    rank = {pair: number for number, pair in enumerate(_visited(len(faces)))}
+    corners = [tuple(row) for row in found.corners.tolist()]
+    both = [
+        (edges[tuple(sorted(row[:2]))], edges[tuple(sorted(row[2:]))])
+        if of_edges
+        else (of_vertex[row[0]], faces[tuple(sorted(row[1:]))])
+        for row, of_edges in zip(corners, found.edges, strict=True)
+    ]
+    ranks = np.array([rank[min(pair), max(pair)] for pair in both])
+    numbers = {number: set(face) for face, number in faces.items()}
+    beside = np.array([bool(numbers[a] & numbers[b]) for a, b in both])
+    for kind in (found.edges, ~found.edges):
+        assert beside[kind].any()
+        assert not beside[kind].all()
+        assert (np.diff(ranks[kind]) >= 0).all()
+
+
+def _fan(count: int, more: int) -> tuple[LayerMesh, np.ndarray]:
+    """Triangles around one vertex, so many on a disc that is folded once, and more below it."""
+    turn = np.linspace(0.0, 1.8 * np.pi, count + 1)
+    disc = np.stack([np.cos(turn), 0.0 * turn, np.sin(turn)], axis=1)
+    below = np.stack([0.2 * np.arange(more + 1.0), np.full(more + 1, -1.0), np.zeros(more + 1)], axis=1)
+    rest = np.concatenate([np.zeros((1, 3)), disc, below])
+    first = np.concatenate([np.arange(1, count + 1), np.arange(count + 2, count + more + 2)])
+    folded = rest.copy()
+    folded[1 : count + 2] = np.where(disc[:, :1] < 0.0, disc * [-1.0, 1.0, 1.0] + [0.0, 2e-3, 0.0], disc)
+    return LayerMesh(rest, np.stack([0 * first, first, first + 1], axis=1), 3e-3), folded
+
+
+def test_a_vertex_of_very_many_faces_has_the_same_pairs() -> None:
+    """Pairs of faces with a common vertex are known beforehand, but where these are as many as the square of 65 and more."""
+    (few, folded), (many, both) = _fan(60, 0), _fan(60, 10)
+    ours = {row for row in _pairs(_layers(few, folded), folded)}
+    theirs = {row for row in _pairs(_layers(many, both), both) if max(row) < len(folded)}
+    assert len(ours) > 20
+    assert {frozenset(row) for row in ours} == {frozenset(row) for row in theirs}
+
+
+def test_pairs_are_asked_for_again_where_positions_changed_in_place() -> None:
+    mesh, pos, _ = _sheets()
+    layers, here = _layers(mesh, pos), pos.copy()
+    assert len(layers.contacts(here).corners) == 0
+    here[len(pos) // 2 :, 1] -= 0.008
+    assert _pairs(layers, here) == _pairs(_layers(mesh, pos), here) != set()

@@ -51,6 +51,20 @@ def test_strain_is_rigidly_invariant_and_nan_when_broken() -> None:
     assert all(np.isnan(value) for value in strain_metrics(CLOTH, pos).values())
 
 
+def test_strain_of_positions_that_changed_in_place_is_measured_again() -> None:
+    pos, faces = grid(4, 4, 0.1)
+    cloth, other = (build_cloth(size * pos, faces, Material()) for size in (1.0, 0.5))
+    here = torch.tensor(pos, dtype=torch.float32)
+    first = strain_metrics(cloth, here)
+    first["strain_p50"] = 7.0  # the caller's own
+    assert strain_metrics(cloth, here)["strain_p50"] < 1e-6
+    assert strain_metrics(other, here)["strain_p50"] == pytest.approx(1.0, abs=1e-5)
+    here *= 1.1
+    assert strain_metrics(cloth, here)["strain_p50"] == pytest.approx(0.1, abs=1e-5)
+    here.numpy()[:] = 1.2 * pos  # no version of the tensor tells this
+    assert strain_metrics(cloth, here)["strain_p50"] == pytest.approx(0.2, abs=1e-5)
+
+
 def test_penetration_counts_vertices_deeper_than_two_millimetres() -> None:
     pos = CLOTH.rest_pos.clone()
     pos[:, 1] = 0.01

@@ -17,7 +17,7 @@ from torch import Tensor
 from hood import native
 from hood.mesh.geometry import MOST_CURVATURE, ROUNDS
 from hood.mesh.topology import unique_edges
-from hood.native.arguments import COUNT, POINTER, REAL, fields, num_parts
+from hood.native.arguments import COUNT, POINTER, REAL, address_of, fields, num_parts
 from hood.native.build import optional
 from hood.tensors.batch import forget, made_of
 
@@ -266,7 +266,7 @@ def _aligned(shape: tuple[int, ...], kind: type) -> np.ndarray:
 def _point(structure: ctypes.Structure, arrays: dict[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         assert array.flags.c_contiguous, f"{name} has gaps"
-        setattr(structure, name, array.ctypes.data)
+        setattr(structure, name, address_of(array) if array.flags.writeable else array.ctypes.data)
 
 
 @torch.no_grad()

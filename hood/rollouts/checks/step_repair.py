@@ -68,7 +68,7 @@ def step_quality(
     A relative gradient that the stepper knows is believed, so that nothing is computed.
     """
     pos = prediction.next_pos
-    if not bool(torch.isfinite(pos).all()):
+    if not math.isfinite(float(pos.sum())):
         return StepQuality(False, math.nan, math.nan)
     if figures is None and (typical or math.isnan(prediction.residual)):
         figures = StepFigures(potential, problem, pos, prediction.acc)

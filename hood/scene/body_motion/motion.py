@@ -189,8 +189,10 @@ class BodyMotion:
             return known[1]
         _forget(self._placed, frame, 2)
         local = self.local_surface(frame)
+        way = self.translation[frame] - origin
         # Filled, not copied: nothing waits for a device.
-        shift = torch.stack([local.new_full((), value) for value in self.translation[frame] - origin])
+        on_host = local.device.type == "cpu"
+        shift = torch.from_numpy(way) if on_host else torch.stack([local.new_full((), value) for value in way])
         # Rounded once, at the end: a mesh that moves as this body does gives the same numbers.
         surface = (local + shift).to(self.dtype)
         self._placed[frame] = key, surface
