@@ -199,7 +199,7 @@ class FilmAlongside:
         if not (count and _is_known_ahead(config, motion) and processors() > 1 and _has_one_thread()):
             return
         ends = list[int]()
-        unheard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # neither process is to end as the other
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # neither process is to end as the other
         try:
             ends += os.pipe()
             ends += os.pipe()
@@ -216,7 +216,7 @@ class FilmAlongside:
                 os.close(end)
             return
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, unheard)
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         incoming, self._told, self._drawn, outgoing = ends
         os.close(incoming)
         os.close(outgoing)
