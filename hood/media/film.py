@@ -196,9 +196,9 @@ class Film:
         part = index / len(self.data.cloth_pos)
         cameras = [take.at(self._path[index], part) for take in self._takes]
         views = render_views(meshes, cameras, self._panel, self.height, floor=self._floor, background=background)
-        for view in views[1:]:
-            view[:, :_DIVIDER, :3] = 255
-        picture = np.ascontiguousarray(np.concatenate(views, axis=1)[:, : self.width])
+        for number in range(1, len(cameras)):
+            views[:, number * self._panel :][:, :_DIVIDER, :3] = 255
+        picture = np.ascontiguousarray(views[:, : self.width])
         told = f"body drawn {1e3 * self.thinner:g} mm thinner" if self.thinner > 0 and len(body) else ""
         return captioned(picture, told) if told else picture
 

@@ -226,7 +226,7 @@ def render_frame(
             not move.
         background: see :data:`hood.media.renderer.shading.Background`.
     """
-    return render_views(meshes, [camera], width, height, floor=floor, background=background)[0]
+    return render_views(meshes, [camera], width, height, floor=floor, background=background)
 
 
 def render_views(
@@ -237,26 +237,26 @@ def render_views(
     *,
     floor: float | None = None,
     background: Background = None,
-) -> list[Picture]:
-    """The same meshes from each camera, as :func:`render_frame` does."""
+) -> Picture:
+    """The same meshes from each camera, as :func:`render_frame` does, side by side: (height, cameras * width, 3 or 4)."""
     surface = _join(meshes)
     floor_height = float(surface.ends[0][1]) if floor is None else floor
     firsts = np.cumsum([0, *(len(np.asarray(mesh.faces)) for mesh in meshes)]).tolist()
     prints = [(first, one) for first, mesh in zip(firsts, meshes, strict=False) for one in mesh.prints]
-    dark, lib, pictures = dark_map(surface, floor_height), library(), []
-    for camera in cameras:
+    dark, lib = dark_map(surface, floor_height), library()
+    picture = np.empty((height, len(cameras) * width, 4 if background == CLEAR else 3), dtype=np.uint8)
+    for number, camera in enumerate(cameras):
+        own = picture[:, number * width : (number + 1) * width]
         light = Light(camera, surface.pos, surface.faces, "shadow", surface.closed)
         view = ViewedSurface.of(camera, surface, SUPERSAMPLING * width, SUPERSAMPLING * height)
         if lib is None:
-            pictures.append(_drawn(camera, light, surface, view, prints, floor_height, (width, height), dark, background))
+            own[:] = _drawn(camera, light, surface, view, prints, floor_height, (width, height), dark, background)
             continue
-        picture = np.empty((height, width, 4 if background == CLEAR else 3), dtype=np.uint8)
         floor_there = floor_values(camera, surface, floor_height, (width, height), dark, background)
         seen, _alive = _seen_values(camera, surface, view, prints)
         given = (ctypes.byref(value) for value in (light.values(), seen, floor_there))
-        lib.picture_draw(*given, len(surface.pos), address(picture))
-        pictures.append(picture)
-    return pictures
+        lib.picture_draw(*given, len(surface.pos), picture.strides[0], address(own))
+    return picture
 
 
 def _drawn(

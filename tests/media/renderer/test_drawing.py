@@ -8,7 +8,7 @@ import pytest
 from hood.media.renderer import raster, render, shading
 from hood.media.renderer import raster as drawing
 from hood.media.renderer.raster import Camera, rasterise
-from hood.media.renderer.render import RenderMesh, hem_distance, render_frame
+from hood.media.renderer.render import RenderMesh, hem_distance, render_frame, render_views
 from hood.testing import cylinder
 
 needs_compiler = pytest.mark.skipif(drawing.library() is None, reason="needs a C++ compiler")
@@ -51,6 +51,28 @@ def test_pictures_are_the_same(in_numpy, elevation):
     low = render_frame(meshes, camera, 90, 120, floor=-2.0).astype(int)
     assert same(low, in_numpy(render_frame, meshes, camera, 90, 120, floor=-2.0))
     assert (low != shown).any() == (elevation >= 0)  # from below there is no floor
+
+
+@needs_compiler
+@pytest.mark.parametrize(("width", "height"), [(24, 32), (1, 3), (7, 10), (17, 1)])
+def test_small_pictures_are_the_same(in_numpy, width, height):
+    """Samples look less than a pixel far there, at themselves, and keep no light off; some are narrower than a register."""
+    meshes = scene()
+    camera = Camera.framing(np.concatenate([np.asarray(mesh.pos) for mesh in meshes]), 30.0, 8.0)
+    shown = render_frame(meshes, camera, width, height).astype(int)
+    expected = in_numpy(render_frame, meshes, camera, width, height)
+    assert same(shown, expected) if width * height > 100 else np.abs(shown - expected).max() <= 1
+
+
+@needs_compiler
+@pytest.mark.parametrize("background", [(0.2, 0.5, 0.9), "transparent"])
+def test_pictures_before_other_backgrounds_are_the_same(in_numpy, background):
+    meshes = scene()
+    camera = Camera.framing(np.concatenate([np.asarray(mesh.pos) for mesh in meshes]), 30.0, 8.0)
+    cameras = [camera, Camera.framing(camera.target, 200.0, 8.0)]
+    shown = render_views(meshes, cameras, 61, 90, background=background).astype(int)
+    assert shown.shape == (90, 122, 4 if background == "transparent" else 3)
+    assert same(shown, in_numpy(render_views, meshes, cameras, 61, 90, background=background))
 
 
 @needs_compiler

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from hood.media import video
 from hood.media.renderer.raster import Camera, barycentric, rasterise
 from hood.media.renderer.render import RenderMesh, contact_sheet, render_frame
+from hood.media.renderer.shading import smoothing
 from hood.media.video import VideoWriter, save_png
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)
@@ -124,6 +126,14 @@ def test_a_shadow_lies_on_the_floor_only_beside_the_mesh() -> None:
     # The key light comes from the upper left of the picture.
     assert (darker[:, 45:] > 12).sum() > 30
     assert (darker[:, :30] > 12).sum() == 0
+
+
+@pytest.mark.parametrize("sigma", [1.4, 4.0])
+def test_shade_on_the_floor_is_smoothed_as_by_scipy(sigma: float) -> None:
+    cells = len(smoothing(sigma))
+    shade = np.random.default_rng(0).random((cells, cells))
+    expected = gaussian_filter(shade, sigma, mode="constant", truncate=3.0)
+    assert smoothing(sigma) @ shade @ smoothing(sigma) == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.parametrize(("azimuth", "elevation", "aspect"), [(0, 0, 0.75), (135, 25, 1.6), (-60, -10, 0.5)])
