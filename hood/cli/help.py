@@ -1,6 +1,8 @@
 """``hood COMMAND --help``: keys with their defaults, and every name that can be given.
 
 ``--cfg`` and ``--info``: the composed config of a command, and what Hydra says about it.
+
+Help is composed without torch; what needs it is imported by the questions that do.
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from hood.app.common import split_words
 from hood.app.settings.compose import (
     CONFIG_FOLDER,
     SWEEP_FLAGS,
@@ -24,7 +25,6 @@ from hood.app.settings.compose import (
     read_word,
     shown,
 )
-from hood.app.sweep import hydra_of
 from hood.assets.files import library
 
 _EXAMPLES = {
@@ -197,10 +197,14 @@ def answer(name: str, words: Sequence[str]) -> int:
     hydras = [word for word in rest if word.lstrip("+~").startswith(("hydra.", "hydra/"))]
     rest = [word for word in rest if word not in hydras and not (name == "train" and word in SWEEP_FLAGS)]
     if name in _BEFORE_KEYS:
+        from hood.app.common import split_words
+
         files = split_words(name, rest)[0]
         rest = [word for word in rest if word not in files]
     config, part = _composed(name, rest), asked.get("--package")
     if "--info" in asked or asked["--cfg"] != "job":
+        from hood.app.sweep import hydra_of
+
         own = load_config(name)
         given = [read_word(word, own)[0] for word in rest if word.partition("=")[0].split(".")[0] in (*own, *_groups_of(name))]
         config = hydra_of(name, [*hydras, *given], asked.get("--info"))

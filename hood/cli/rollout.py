@@ -1,24 +1,25 @@
 """``hood rollout``, ``hood dress``, ``hood fit`` and ``hood train``: progress bars and exit codes of :mod:`hood.app.rollout`,
-:mod:`hood.app.batch.dress`, :mod:`hood.app.fit` and :mod:`hood.app.train`."""
+:mod:`hood.app.batch.dress`, :mod:`hood.app.fit` and :mod:`hood.app.train`.
+
+Each command imports what the others do without when it is called.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from hood.app.batch.dress import dress_rows
-from hood.app.fit import run_fit
 from hood.app.notices import Item
 from hood.app.output.verdict import exit_code
 from hood.app.rollout import Rollouts, rollout
-from hood.app.sweep import is_sweep, run_sweep
-from hood.app.train import Tick
-from hood.app.train import train as trained
-from hood.cli.compare import table_of_runs
 from hood.training import distributed
+
+if TYPE_CHECKING:
+    from hood.app.train import Tick
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -48,19 +49,28 @@ def code_of(done: Rollouts) -> int:
 def dressed(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where more rows failed than
     ``fail_fraction`` says, else 3 where more are unsound, else 0."""
+    from hood.app.batch.dress import dress_rows
+
     return dress_rows(overrides).code
 
 
 def fitted(overrides: Sequence[str]) -> int:
     """Run ``hood fit``; returns the exit code: 130 where the user interrupted it, 3 where it has not converged, else 0."""
+    from hood.app.fit import run_fit
+
     return run_fit(overrides).code
 
 
 def train(overrides: Sequence[str]) -> int:
     """Run the command; returns the exit code: 130 where the user interrupted it, else 2 where a run of a sweep failed, else
     0."""
+    from hood.app.sweep import is_sweep, run_sweep
+    from hood.app.train import train as trained
+
     if not is_sweep(overrides):
         return 130 if trained(overrides, training_bar).interrupted else 0
+    from hood.cli.compare import table_of_runs
+
     done = run_sweep(overrides)
     print("\n".join(table_of_runs(done.runs) if done.runs else ["no run has begun"]), flush=True)
     for folder, reason in done.failed.items():

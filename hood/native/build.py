@@ -142,8 +142,8 @@ def processor() -> str:
     """What tells processors apart that need different code: the architecture and what it can do."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
-    abilities = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
-    return f"{platform.system()} {platform.machine()} {abilities}"
+    abilities = next((line for line in lines if line.startswith(("flags", "Features"))), None)
+    return f"{platform.system()} {platform.machine()} {platform.processor() if abilities is None else abilities}"
 
 
 def compile_library(compiler: str, flags: Sequence[str], source: Path, path: Path) -> None:
@@ -180,9 +180,14 @@ def _place(folder: Path, compiler: str, source: Path, flags: Sequence[str]) -> P
 
 
 def _digest(compiler: str, source: Path, flags: Sequence[str]) -> str:
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    parts = [compiler, version, processor(), *flags, source_text(source)]
+    parts = [compiler, _version(compiler), processor(), *flags, source_text(source)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+@cache
+def _version(compiler: str) -> str:
+    """What the compiler says it is; asked once, since every library asks for it."""
+    return subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
 
 
 def _kept(path: Path) -> ctypes.CDLL | None:

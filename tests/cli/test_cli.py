@@ -245,7 +245,9 @@ import sys
 from hood.cli import main
 main.main([])
 main.main(["--version"])
-assert "torch" not in sys.modules, "the usage loads torch"
+for command in main.COMMANDS:
+    main.main([command, "--help"])
+assert not {"torch", "scipy"} & set(sys.modules), "what is only printed loads torch"
 main._keep_memory_mapped()
 import torch
 assert torch.get_num_threads() == 1, torch.get_num_threads()

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from hood.app.common import UNTRAINED, load_stepper, require_same_model, use_arithmetic, weigh
 from hood.app.scene.fabrics import AUTO, measured_in, solved
-from hood.app.settings.compose import ConfigError, build, load_config, options, plain
+from hood.app.settings.compose import CONFIG_FOLDER, ConfigError, build, load_config, options, plain
 from hood.app.settings.rollout_settings import RolloutSettings, Settings
 from hood.assets.files.library import locate
 from hood.energies.potential import Potential
@@ -143,8 +143,10 @@ def find_option(name: str) -> StepperOption | None:
 @lru_cache(maxsize=32)
 def _content(name: str, plugins: tuple[Path, ...]) -> dict[str, Any]:
     """The keys of an option, ours or one from the config folders of ``plugins``."""
-    config = load_config("rollout", [f"{GROUP}={name}"])
-    return {key: plain(config.get(key)) for key in ("stepper", "stepping")}
+    file = CONFIG_FOLDER / GROUP / f"{name}.yaml"
+    # One of ours says all by itself; it is read in a hundredth of the time of composing a rollout with it.
+    content = plain(OmegaConf.load(file) if file.exists() else load_config("rollout", [f"{GROUP}={name}"]))
+    return {key: content.get(key) for key in ("stepper", "stepping")}
 
 
 def _option(name: str, keys: Any) -> StepperOption:

@@ -29,6 +29,14 @@ def test_an_option_says_its_name(name: str) -> None:
     assert find_option(name) == (None if option.network else option)
 
 
+@pytest.mark.parametrize("name", options("stepper"))
+def test_an_option_changes_no_further_key(name: str) -> None:
+    """Its file is read by itself where a rollout that is composed takes another option."""
+    composed = RolloutSettings.from_words([f"stepper={name}"])
+    assert dict(with_stepper(RolloutSettings.from_words(["stepper=auto"]), name)) == dict(composed)
+    assert dict(with_stepper(RolloutSettings.from_words(["stepper=newton"]), name)) == dict(composed)
+
+
 def test_the_last_of_several_words_counts() -> None:
     assert (
         str(RolloutSettings.from_words(["stepper=auto", "stepper=newton", "losses=reference", "losses=default"]).stepper)
