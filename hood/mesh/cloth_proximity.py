@@ -20,7 +20,7 @@ import numpy as np
 from hood import native
 from hood.mesh import topology
 from hood.mesh.flat import flat_mesh
-from hood.native.arguments import COUNT, POINTER, REAL, fields
+from hood.native.arguments import COUNT, POINTER, REAL, fields, num_parts
 from hood.native.build import LAYER_FLAGS, build
 
 _SOURCE = Path(native.__file__).with_name("layers.cpp")
@@ -31,6 +31,8 @@ LEFT = 0.1
 SHARE, MARGIN = 0.3, 5e-3
 #: Beyond its reach by so much [m] a pair is apart after any shift of all cloth, rounded as it may be.
 SPARE = 1e-6
+#: Faces that are worth a thread in a search for pairs.
+_FACES = 1000
 #: Share of a move that is left where features would meet, below which it is bent around them (:meth:`Layers.ease`).
 EASED = 0.1
 
@@ -51,7 +53,7 @@ def library() -> ctypes.CDLL:
     """
     lib = build(_SOURCE, LAYER_FLAGS)
     lib.layers_make.restype = POINTER
-    lib.layers_make.argtypes = [*[POINTER] * 5, REAL, COUNT, COUNT]
+    lib.layers_make.argtypes = [*[POINTER] * 5, REAL, *[COUNT] * 3]
     lib.layers_topology.restype = POINTER
     for name in ("topology", "topology_free", "free"):
         getattr(lib, f"layers_{name}").argtypes = [POINTER]
@@ -126,7 +128,7 @@ class LayerMesh:
             "edge_length_sq": length**2,
         }
         self.apart: _Apart | None = None  # where a step has ended lately
-        self.num_vertices, self.reach = len(rest), self._arrays["reach"]  # (V,) m
+        self.num_vertices, self.num_faces, self.reach = len(rest), len(faces), self._arrays["reach"]  # reach (V,) m
         counts = len(rest), len(faces), len(edges)
         self._structure = _Mesh(*counts, *(self._arrays[name].ctypes.data for name in self._arrays))
 
@@ -247,7 +249,7 @@ class ClothSurface:
         margin = np.minimum(SHARE * mesh.room, MARGIN)
         given = (start.ctypes.data, end.ctypes.data, held.ctypes.data, margin.ctypes.data)
         self._apart = mesh.known_apart(start, held, between)
-        rules = pressure, int(between), int(self._apart)
+        rules = pressure, int(between), int(self._apart), num_parts(mesh.num_faces, _FACES)
         self.handle = self._lib.layers_make(mesh.address, *given, *rules)
         weakref.finalize(self, self._lib.layers_free, self.handle)
         self._held, self.between = held, between

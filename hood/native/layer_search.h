@@ -2,7 +2,7 @@
 //
 // A box has bounds where the way begins and where it ends; in between it is nowhere larger than the bounds between those. Two boxes
 // that are apart along an axis, in the same order at both ends, are apart all the way: cloth that moves together is told apart as well
-// as cloth that rests.
+// as cloth that rests. Axes are x, y, z and a diagonal, for which a register has room: a quarter of the pairs is apart along it alone.
 #pragma once
 #include <algorithm>
 #include <array>
@@ -12,11 +12,12 @@
 #include <vector>
 
 #include "lanes.h"
+#include "threads.h"
 #include "vector.h"
 
 namespace {
 
-typedef float Axes __attribute__((vector_size(16)));  // three, and a spare one
+typedef float Axes __attribute__((vector_size(16)));
 typedef decltype(Axes{} < Axes{}) AxesTest;
 
 struct MovingBox {
@@ -205,28 +206,31 @@ struct LayerTree {
             for (int end = 0; end < 2; ++end) {
                 const double* at = (end ? to : from) + 3 * v;
                 const double x = at[0] - centre[0], y = at[1] - centre[1], z = at[2] - centre[2];
-                box.low[end] = Axes{(float)(x - more), (float)(y - more), (float)(z - more), 0.0f};
-                box.high[end] = Axes{(float)(x + more), (float)(y + more), (float)(z + more), 0.0f};
+                const double diagonal = 0.5773502691896258 * (x - y + z);
+                box.low[end] = Axes{(float)(x - more), (float)(y - more), (float)(z - more), (float)(diagonal - more)};
+                box.high[end] = Axes{(float)(x + more), (float)(y + more), (float)(z + more), (float)(diagonal + more)};
             }
         }
     }
 
-    void build(const LayerMesh& mesh) {
+    void build(const LayerMesh& mesh, int64_t parts) {
         num_faces = mesh.num_faces;
         const std::vector<int32_t>&vertices = mesh.topology->vertices.number, &edges = mesh.topology->edges.number;
-        own_vertex.resize(vertices.size()), own_edge.resize(edges.size());
-        for (size_t i = 0; i < vertices.size(); ++i) own_vertex[i] = vertex[vertices[i]];
-        for (size_t i = 0; i < edges.size(); ++i) {
-            const int32_t* ends = mesh.edges + 2 * (int64_t)edges[i];
-            own_edge[i] = vertex[ends[0]];
-            join(own_edge[i], vertex[ends[1]]);
-        }
-        face.resize(num_faces);
-        for (int64_t i = 0; i < num_faces; ++i) {
-            const std::array<int32_t, 3>& corner = mesh.topology->corners[i];
-            face[i] = vertex[corner[0]];
-            join(face[i], vertex[corner[1]]), join(face[i], vertex[corner[2]]);
-        }
+        own_vertex.resize(vertices.size()), own_edge.resize(edges.size()), face.resize(num_faces);
+        for_parts(parts, [&](int64_t part) {
+            const Range mine[3] = {range_of(vertices.size(), part, parts), range_of(edges.size(), part, parts), range_of(num_faces, part, parts)};
+            for (int64_t i = mine[0].begin; i < mine[0].end; ++i) own_vertex[i] = vertex[vertices[i]];
+            for (int64_t i = mine[1].begin; i < mine[1].end; ++i) {
+                const int32_t* ends = mesh.edges + 2 * (int64_t)edges[i];
+                own_edge[i] = vertex[ends[0]];
+                join(own_edge[i], vertex[ends[1]]);
+            }
+            for (int64_t i = mine[2].begin; i < mine[2].end; ++i) {
+                const std::array<int32_t, 3>& corner = mesh.topology->corners[i];
+                face[i] = vertex[corner[0]];
+                join(face[i], vertex[corner[1]]), join(face[i], vertex[corner[2]]);
+            }
+        });
         int64_t size = 1;  // halves differ by a face at most, so that the levels above the last are full
         for (int64_t most = num_faces; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
         node.resize(size);
@@ -247,9 +251,42 @@ struct LayerTree {
         join(node[at], node[2 * at + 2]);
     }
 
-    // visit(i, j) for pairs of faces whose boxes overlap.
-    template <class Visit> void pairs(const Visit& visit) const {
-        if (num_faces > 1) within(0, 0, num_faces, visit);
+    // A piece of the search: pairs within a node, or between two.
+    struct Piece {
+        int64_t a, a0, a1, b, b0, b1;  // b -1: within a
+    };
+
+    // The search for pairs of faces whose boxes overlap, in pieces of at most so many faces and in their order.
+    std::vector<Piece> pieces(int64_t most) const {
+        std::vector<Piece> found;
+        if (num_faces > 1) halve({0, 0, num_faces, -1, 0, 0}, most, found);
+        return found;
+    }
+
+    void halve(const Piece& piece, int64_t most, std::vector<Piece>& found) const {
+        const auto [a, a0, a1, b, b0, b1] = piece;
+        if (a1 - a0 + b1 - b0 <= std::max(most, 2 * LEAF)) {
+            found.push_back(piece);
+        } else if (const int64_t middle = (a0 + a1) / 2; b < 0) {
+            halve({2 * a + 1, a0, middle, -1, 0, 0}, most, found);
+            halve({2 * a + 2, middle, a1, -1, 0, 0}, most, found);
+            halve({2 * a + 1, a0, middle, 2 * a + 2, middle, a1}, most, found);
+        } else if (!overlap(node[a], node[b])) {
+            return;
+        } else if (halves_first(a1 - a0, b1 - b0)) {
+            halve({2 * a + 1, a0, middle, b, b0, b1}, most, found);
+            halve({2 * a + 2, middle, a1, b, b0, b1}, most, found);
+        } else {
+            const int64_t half = (b0 + b1) / 2;
+            halve({a, a0, a1, 2 * b + 1, b0, half}, most, found);
+            halve({a, a0, a1, 2 * b + 2, half, b1}, most, found);
+        }
+    }
+
+    // visit(i, j) for pairs of faces whose boxes overlap, of a piece.
+    template <class Visit> void pairs(const Piece& piece, const Visit& visit) const {
+        if (piece.b < 0) within(piece.a, piece.a0, piece.a1, visit);
+        else between(piece.a, piece.a0, piece.a1, piece.b, piece.b0, piece.b1, visit);
     }
 
     template <class Visit> void within(int64_t at, int64_t begin, int64_t end, const Visit& visit) const {

@@ -8,14 +8,14 @@ extern "C" {
 // Layers of a step from positions on, which may end ``ahead``; ``margins`` (V) [m] is how far vertices may be off straight ways;
 // ``apart`` says that nothing is near or through anything there.
 void* layers_make(const void* mesh, const double* pos, const double* ahead, const uint8_t* fixed, const double* margins, double pressure, int64_t between,
-                  int64_t apart) {
+                  int64_t apart, int64_t threads) {
     Layers* layers = new Layers;
     layers->mesh = *(const LayerMesh*)mesh;
     layers->fixed.assign(fixed, fixed + layers->mesh.num_vertices);
     layers->start.assign(pos, pos + 3 * layers->mesh.num_vertices);
     layers->ahead.assign(ahead, ahead + 3 * layers->mesh.num_vertices);
     layers->margin.assign(margins, margins + layers->mesh.num_vertices);
-    layers->pressure = pressure, layers->between = between != 0, layers->known_apart = apart != 0;
+    layers->pressure = pressure, layers->between = between != 0, layers->known_apart = apart != 0, layers->threads = threads;
     return layers;
 }
 

@@ -8,6 +8,7 @@
 // reach the distance is measured again. The numbering is the cloth's own.
 #pragma once
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -96,6 +97,7 @@ struct Layers {
     std::vector<uint64_t> keys;
     std::vector<double> bounds;  // of the distances of the pairs, and what the cloth had moved when they were found [m]
     std::vector<LayerContact> contacts;  // of the last model
+    int64_t threads = 1;
     LayerTree tree;
     std::vector<double> start, ahead;  // (3 V) where the step begins, and where it may end
     std::vector<double> resort;        // (3 V) where ways lead that are known to be free; or none
@@ -120,8 +122,29 @@ struct Layers {
         void make_room(size_t more) {
             if (list.size() < count + more) list.resize(2 * (count + more));
         }
-    } candidates[2], beside[2];  // the latter of faces with a common vertex
-    std::vector<std::array<int32_t, 2>> found_at;  // places of the faces of the pairs that the last search has found of a kind
+    };
+    struct Listed {
+        std::vector<LayerPair> pairs;
+        std::vector<uint64_t> keys;
+        std::vector<double> bounds;
+        std::vector<std::array<int32_t, 2>> found_at;  // places of the faces of the pairs
+    };
+    // What a part of a search finds, of points and faces and of edges: of faces without a common vertex, and of those with one.
+    struct Found {
+        Candidates candidates[2], beside[2];
+        Listed listed[2], listed_beside[2];
+        std::vector<uint64_t> released;
+        int64_t looked_at, crossed, told;  // of the candidates, how many the tally knows of
+
+        int64_t count() const { return candidates[0].count + candidates[1].count + beside[0].count + beside[1].count; }
+    };
+    std::vector<std::array<int32_t, 2>> found_at;  // of the pairs that the last search has found of a kind
+    // Of all parts of a search together, now and then: one that finds too much ends early, in as many parts as it may be.
+    struct Tally {
+        std::atomic<int64_t> looked_at{0}, count{0};
+        std::atomic<bool> over{false};
+    };
+    static constexpr int64_t NOW_AND_THEN = 256;
     std::vector<double> wide;
     std::vector<int32_t> strays;
     // For the solver.
@@ -141,6 +164,7 @@ struct Layers {
     static constexpr int64_t MOST_PAIRS = 4000000;
     static constexpr int64_t MOST_LOOKS = 300;  // at pairs of faces, for each face: beyond it the cloth is torn
     static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
+    static constexpr int64_t PARTS = 8;         // of a search, for each thread
     static constexpr size_t FEW = 16;           // at most one of so many vertices is looked for alone
 
     // The list of straight ways between positions (V, 3), or of the pairs of some vertices alone.
@@ -158,13 +182,20 @@ struct Layers {
         overflowed = overflowed || !finite();
         if (overflowed || mesh.num_faces < 2) return;
         make_boxes();
-        if (some) fill_around(*some);
-        else fill([&](const auto& look) { tree.pairs(look); }, first, nullptr);
+        if (some) return fill_around(*some);
+        // Parts that are done early leave the others to the threads; what is found does not depend on their number.
+        const int64_t parts = std::min(threads > 1 ? PARTS * threads : 1, MOST_PARTS);
+        const std::vector<LayerTree::Piece> pieces = tree.pieces(parts > 1 ? mesh.num_faces / (2 * parts) : mesh.num_faces);
+        const auto visit = [&](int64_t part, const auto& look) {
+            const Range mine = range_of(pieces.size(), part, parts);
+            for (int64_t i = mine.begin; i < mine.end; ++i) tree.pairs(pieces[i], look);
+        };
+        fill(parts, visit, first, nullptr);
     }
 
     // Adds the pairs of some vertices.
     void fill_around(const std::vector<uint8_t>& some) {
-        const auto visit = [&](const auto& look) {
+        const auto visit = [&](int64_t, const auto& look) {
             for (int64_t i = 0; i < mesh.num_faces; ++i) {
                 if (!any_of(corners_at(i), 3, some)) continue;
                 tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
@@ -172,7 +203,7 @@ struct Layers {
                 });
             }
         };
-        fill(visit, false, &some);
+        fill(1, visit, false, &some);
     }
 
     // The list where few vertices have left their margins: their pairs alone are looked for anew, on straight ways between
@@ -209,52 +240,92 @@ struct Layers {
         wide.resize(mesh.num_vertices);
         for (int64_t v = 0; v < mesh.num_vertices; ++v) wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
         tree.enclose(from.data(), to.data(), wide);
-        tree.build(mesh);
+        tree.build(mesh, threads);
     }
 
     // Adds pairs of features of the pairs of faces that are visited; where ``stray`` is given, only those with such a vertex.
-    template <class Faces> void fill(const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
-        int64_t looked_at = 0;
-        for (int edges = 0; edges < 2; ++edges) candidates[edges].count = beside[edges].count = 0;
-        const LayerTopology& topology = *mesh.topology;
-        if (!stray) list_beside();
-        const auto too_many = [&] {
-            const size_t count = candidates[0].count + candidates[1].count + beside[0].count + beside[1].count;
-            return looked_at > MOST_LOOKS * mesh.num_faces || (int64_t)count > MOST_PAIRS;
-        };
-        const OwnFeatures &vertices = topology.vertices, &edges = topology.edges;
-        visit([&](int64_t i, int64_t j) {
-            if (too_many()) return;
-            ++looked_at;
-            if (!stray && topology.meet(i, j)) return;
-            if (first && crossed_faces(mesh.order[i], mesh.order[j], from.data())) ++crossed, release_faces(mesh.order[i], mesh.order[j]);
-            candidates[0].make_room(6), candidates[1].make_room(9);
-            for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j, i, j);
-            for (int32_t v = vertices.starts[j]; v < vertices.starts[j + 1]; ++v) consider_vertex(v, i, i, j);
-            for (int32_t a = edges.starts[i]; a < edges.starts[i + 1]; ++a)
-                for (int32_t b = edges.starts[j]; b < edges.starts[j + 1]; ++b) consider_edges(a, b, i, j);
+    template <class Faces> void fill(int64_t parts, const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
+        std::vector<Found>& found = memory();  // of this thread, not of those that help
+        if ((int64_t)found.size() < parts) found.resize(parts);
+        Tally tally;
+        for_parts(parts, [&](int64_t part) {
+            Found& mine = found[part];
+            mine.looked_at = mine.crossed = mine.told = 0, mine.released.clear();
+            for (int edges = 0; edges < 2; ++edges) mine.candidates[edges].count = mine.beside[edges].count = 0;
+            if (!stray) list_beside(part, parts, mine);
+            visit(part, [&](int64_t i, int64_t j) { look_at(i, j, first, stray, mine, tally); });
         });
-        overflowed = too_many();
-        if (overflowed) return;
+        int64_t looked_at = 0, count = 0;
+        for (int64_t part = 0; part < parts; ++part) looked_at += found[part].looked_at, count += found[part].count();
+        overflowed = too_many(looked_at, count);
+        if (overflowed) {
+            found = {};  // gigabytes, perhaps
+            return;
+        }
+        for (int64_t part = 0; part < parts; ++part) {
+            crossed += found[part].crossed;
+            released.insert(released.end(), found[part].released.begin(), found[part].released.end());
+        }
         if (first) std::sort(released.begin(), released.end());
+        for_parts(parts, [&](int64_t part) {
+            for (int edges = 0; edges < 2; ++edges) {
+                Found& mine = found[part];
+                measure(edges, mine.candidates[edges], stray, mine.listed[edges]);
+                measure(edges, mine.beside[edges], stray, mine.listed_beside[edges]);
+            }
+        });
         for (int edges = 0; edges < 2; ++edges) {
             const size_t before = pairs.size();
             found_at.clear();
-            for (size_t i = 0; i < candidates[edges].count; i += AT_ONCE) measure(edges, candidates[edges], i, stray);
+            for (int64_t part = 0; part < parts; ++part) add(found[part].listed[edges]);
             const size_t apart = pairs.size();
-            for (size_t i = 0; i < beside[edges].count; i += AT_ONCE) measure(edges, beside[edges], i, stray);
+            for (int64_t part = 0; part < parts; ++part) add(found[part].listed_beside[edges]);
             if (before < apart && apart < pairs.size()) merge(before, apart);
         }
     }
 
-    // Pairs of faces with a common vertex whose boxes overlap.
-    void list_beside() {
+    // Memory that the next search of a thread uses again.
+    static std::vector<Found>& memory() {
+        thread_local std::vector<Found> kept;
+        return kept;
+    }
+
+    bool too_many(int64_t looked_at, int64_t count) const { return looked_at > MOST_LOOKS * mesh.num_faces || count > MOST_PAIRS; }
+
+    // Takes up the pairs of features of two faces whose boxes overlap.
+    void look_at(int64_t i, int64_t j, bool first, const std::vector<uint8_t>* stray, Found& mine, Tally& tally) const {
+        if (tally.over.load(std::memory_order_relaxed)) return;
+        if (mine.looked_at && mine.looked_at % NOW_AND_THEN == 0) {
+            const int64_t count = mine.count(), more = count - mine.told;
+            mine.told = count;
+            if (too_many(tally.looked_at += NOW_AND_THEN, tally.count += more)) tally.over = true;
+        }
+        const LayerTopology& topology = *mesh.topology;
+        const OwnFeatures &vertices = topology.vertices, &edges = topology.edges;
+        ++mine.looked_at;
+        if (!stray && topology.meet(i, j)) return;
+        if (first && crossed_faces(mesh.order[i], mesh.order[j], from.data())) ++mine.crossed, release_faces(mesh.order[i], mesh.order[j], mine.released);
+        mine.candidates[0].make_room(6), mine.candidates[1].make_room(9);
+        for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j, i, j, mine.candidates[0]);
+        for (int32_t v = vertices.starts[j]; v < vertices.starts[j + 1]; ++v) consider_vertex(v, i, i, j, mine.candidates[0]);
+        for (int32_t a = edges.starts[i]; a < edges.starts[i + 1]; ++a)
+            for (int32_t b = edges.starts[j]; b < edges.starts[j + 1]; ++b) consider_edges(a, b, i, j, mine.candidates[1]);
+    }
+
+    void add(const Listed& more) {
+        pairs.insert(pairs.end(), more.pairs.begin(), more.pairs.end()), keys.insert(keys.end(), more.keys.begin(), more.keys.end());
+        bounds.insert(bounds.end(), more.bounds.begin(), more.bounds.end()), found_at.insert(found_at.end(), more.found_at.begin(), more.found_at.end());
+    }
+
+    // Pairs of faces with a common vertex whose boxes overlap, of a part of what is known of them.
+    void list_beside(int64_t part, int64_t parts, Found& mine) const {
         for (int edges = 0; edges < 2; ++edges) {
             const std::vector<MovingBox>&one = edges ? tree.own_edge : tree.own_vertex, &other = edges ? tree.own_edge : tree.face;
             const std::vector<Candidate>& known = mesh.topology->beside[edges];
             const std::vector<std::array<int32_t, 2>>& boxes = mesh.topology->boxes[edges];
-            if (beside[edges].list.size() <= known.size()) beside[edges].list.resize(known.size() + 1);
-            for (size_t i = 0; i < known.size(); ++i) beside[edges].offer(known[i], overlap(one[boxes[i][0]], other[boxes[i][1]]));
+            const Range some = range_of(known.size(), part, parts);
+            if ((int64_t)mine.beside[edges].list.size() <= some.end - some.begin) mine.beside[edges].list.resize(some.end - some.begin + 1);
+            for (int64_t i = some.begin; i < some.end; ++i) mine.beside[edges].offer(known[i], overlap(one[boxes[i][0]], other[boxes[i][1]]));
         }
     }
 
@@ -275,16 +346,16 @@ struct Layers {
     const int32_t* corners_at(int64_t place) const { return mesh.faces + 3 * (int64_t)mesh.order[place]; }
 
     // Features by their places in the tree, of the faces i and j.
-    void consider_vertex(int32_t place, int64_t at_face, int64_t i, int64_t j) {
+    void consider_vertex(int32_t place, int64_t at_face, int64_t i, int64_t j, Candidates& to) const {
         const int32_t v = mesh.topology->vertices.number[place];
         const bool near = overlap(tree.own_vertex[place], tree.face[at_face]) & !mesh.topology->holds(at_face, v);
-        candidates[0].offer({v, mesh.order[at_face], {(int32_t)i, (int32_t)j}}, near);
+        to.offer({v, mesh.order[at_face], {(int32_t)i, (int32_t)j}}, near);
     }
 
-    void consider_edges(int32_t place, int32_t other, int64_t i, int64_t j) {
+    void consider_edges(int32_t place, int32_t other, int64_t i, int64_t j, Candidates& to) const {
         const int32_t a = mesh.topology->edges.number[place], b = mesh.topology->edges.number[other];
         const bool near = overlap(tree.own_edge[place], tree.own_edge[other]) & !LayerTopology::meet(mesh, a, b);
-        candidates[1].offer({std::min(a, b), std::max(a, b), {(int32_t)i, (int32_t)j}}, near);
+        to.offer({std::min(a, b), std::max(a, b), {(int32_t)i, (int32_t)j}}, near);
     }
 
     void corners_of(int edges, Candidate pair, int32_t* corner) const {
@@ -294,9 +365,15 @@ struct Layers {
         std::copy(second, second + (edges ? 2 : 3), corner + (edges ? 2 : 1));
     }
 
-    // Adds those of the next candidates to the list that can come within their reach: by the distance halfway, less what the
-    // features move towards each other from there and what they may be off their ways.
-    void measure(int edges, const Candidates& given, size_t begin, const std::vector<uint8_t>* stray) {
+    // Those of the candidates that can come within their reach.
+    void measure(int edges, const Candidates& given, const std::vector<uint8_t>* stray, Listed& into) const {
+        into.pairs.clear(), into.keys.clear(), into.bounds.clear(), into.found_at.clear();
+        for (size_t i = 0; i < given.count; i += AT_ONCE) measure(edges, given, i, stray, into);
+    }
+
+    // Of the next candidates: by the distance halfway, less what the features move towards each other from there and what they may
+    // be off their ways.
+    void measure(int edges, const Candidates& given, size_t begin, const std::vector<uint8_t>* stray, Listed& into) const {
         const std::vector<Candidate>& list = given.list;
         const int count = (int)std::min<size_t>(AT_ONCE, given.count - begin), split = edges ? 2 : 1;
         int32_t corner[AT_ONCE][4];
@@ -334,23 +411,23 @@ struct Layers {
             const double bound = std::sqrt(square[lane]) - (moving ? std::sqrt(way[0][lane]) + std::sqrt(way[1][lane]) : 0.0) - SLACK;
             if (bound > reach + off[0] + off[1]) continue;
             // Vertices that were looked for alone are off the middle of their ways, at a time when the cloth has moved already.
-            add(edges, list[begin + lane], corner[lane], reach, stray ? bound - off[0] - off[1] + moved : bound);
+            add(edges, list[begin + lane], corner[lane], reach, stray ? bound - off[0] - off[1] + moved : bound, into);
         }
     }
 
-    void add(int edges, Candidate found, const int32_t* corner, double reach, double bound) {
+    void add(int edges, Candidate found, const int32_t* corner, double reach, double bound, Listed& into) const {
         const uint64_t k = key(edges, found.first, found.second);
         if (is_released(k)) return;
         LayerPair pair;
         std::copy(corner, corner + 4, pair.corner);
-        pair.edges = edges, pair.reach = reach, pair.area = mesh.vertex_area[found.first], pair.parallel = 0.0;
+        pair.edges = edges, pair.reach = reach, pair.area = edges ? 0.0 : mesh.vertex_area[found.first], pair.parallel = 0.0;
         if (edges) {
             const int64_t a = found.first, b = found.second;
             pair.area = 0.5 * (mesh.edge_area[a] + mesh.edge_area[b]);
             pair.parallel = 1e-3 * mesh.edge_length_sq[a] * mesh.edge_length_sq[b];
         }
-        pairs.push_back(pair), keys.push_back(k), bounds.push_back(bound);
-        found_at.push_back({found.faces[0], found.faces[1]});
+        into.pairs.push_back(pair), into.keys.push_back(k), into.bounds.push_back(bound);
+        into.found_at.push_back({found.faces[0], found.faces[1]});
     }
 
     bool is_released(uint64_t k) const { return !released.empty() && std::binary_search(released.begin(), released.end(), k); }
@@ -530,14 +607,14 @@ struct Layers {
         return begin;
     }
 
-    void release_faces(int64_t f, int64_t g) {
+    void release_faces(int64_t f, int64_t g, std::vector<uint64_t>& to) const {
         const int32_t *a = mesh.faces + 3 * f, *b = mesh.faces + 3 * g;
         for (int c = 0; c < 3; ++c) {
-            released.push_back(key(0, a[c], g));
-            released.push_back(key(0, b[c], f));
+            to.push_back(key(0, a[c], g));
+            to.push_back(key(0, b[c], f));
             for (int d = 0; d < 3; ++d) {
                 const int64_t one = edge_number(a[c], a[(c + 1) % 3]), two = edge_number(b[d], b[(d + 1) % 3]);
-                released.push_back(key(1, std::min(one, two), std::max(one, two)));
+                to.push_back(key(1, std::min(one, two), std::max(one, two)));
             }
         }
     }

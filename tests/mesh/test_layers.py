@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
-from hood.mesh import topology
+from hood.mesh import cloth_proximity, topology
 from hood.mesh.cloth_proximity import ClothSurface, LayerMesh
 from hood.mesh.penetration.crossing import self_crossings
 from hood.testing import grid
@@ -129,6 +132,49 @@ def test_pairs_in_reach_are_those_of_all_pairs_at_random_and_crushed() -> None:
         counts.append(_require_all_pairs(_layers(mesh, pos), faces, here))
     assert counts[0] < counts[-1]
     assert counts[-1] > 1000
+
+
+@pytest.mark.parametrize("squeeze", [1.0, 0.3, 0.05])
+def test_what_is_found_and_its_order_do_not_depend_on_the_threads(squeeze: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of pairs in reach, of pairs of faces that are crossed at the start, and of a way that is limited."""
+    mesh, pos, _ = _sheets(12)
+    rng = np.random.default_rng(7)
+    here = pos * np.array([squeeze, 0.3, squeeze]) + 2e-3 * rng.normal(size=pos.shape)
+    there = here + 5e-3 * rng.normal(size=pos.shape)
+    found = []
+    for threads in (1, 2, 5, 64):
+        monkeypatch.setattr(cloth_proximity, "num_parts", lambda count, least, threads=threads: threads)
+        layers = _layers(mesh, here)
+        contacts, crossed = layers.contacts(here), layers.crossed
+        arrays = contacts.corners, contacts.edges, contacts.weights
+        found.append((*arrays, crossed, layers.limit(here, there), layers.contacts(there).corners, layers.work.listed))
+    assert len(found[0][0]) > 20
+    assert squeeze > 0.1 or found[0][-4] > 0
+    for others in found[1:]:
+        for one, other in zip(found[0], others, strict=True):
+            assert np.array_equal(one, other)
+
+
+_TORN = """
+import resource, sys
+import numpy as np
+from hood.mesh import cloth_proximity
+from hood.testing import grid
+cloth_proximity.num_parts = lambda count, least: int(sys.argv[1])
+pos, faces = grid(45, 45, 0.4)
+mesh, torn = cloth_proximity.LayerMesh(pos, faces, 3e-3), 1e-4 * np.random.default_rng(0).normal(size=pos.shape)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+layers = cloth_proximity.ClothSurface(mesh, torn, np.zeros(len(pos), bool), pressure=20.0)
+print(layers.crossed, *layers.work[:2], layers.work.overflowed, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.parametrize("threads", ["1", "16"])
+def test_cloth_where_all_is_near_all_is_told_of_and_takes_no_more_memory_with_many_threads(threads: str) -> None:
+    run = subprocess.run([sys.executable, "-c", _TORN, threads], capture_output=True, text=True, check=True, timeout=300)
+    *found, kilobytes = run.stdout.split()
+    assert found == ["0", "0", "0", "True"]
+    assert int(kilobytes) < 500_000
 
 
 def test_pairs_in_reach_are_those_of_all_pairs_whatever_was_asked_before() -> None:
