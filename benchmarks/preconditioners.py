@@ -21,6 +21,11 @@ level there would be the product with it, and to set it up once an iteration of 
 of seven times.
 
     python benchmarks/preconditioners.py dress dress_4k dress_12k --time
+
+``--parts`` prints instead how many iterations the solver takes where its rows are in so many parts, each swept by a thread of
+its own, as a multiple of those in one part: with usual blocks where parts meet, and with the larger ones that it has.
+
+    python benchmarks/preconditioners.py dress dress_4k dress_12k --parts 2 4
 """
 
 from __future__ import annotations
@@ -39,7 +44,7 @@ from scipy.sparse import linalg
 from hood.energies.potential import default_potential
 from hood.energies.problem import StepProblem
 from hood.rollouts.loop import simulate
-from hood.solver.compiled.system import CompiledSystem
+from hood.solver.compiled.system import TOLERANCES, CompiledSystem
 from hood.solver.newton import NewtonSettings
 from hood.solver.system.iterate import in_double
 from hood.solver.system.plan import plan_for
@@ -66,8 +71,8 @@ class System:
     number: int
 
 
-def systems(garment: str, motion: str, frames: int) -> Iterator[System]:
-    """Those of some steps of a rollout."""
+def steps_of(garment: str, motion: str, frames: int) -> list[StepProblem]:
+    """Some steps of a rollout, in float64."""
     potential, steps = default_potential(), list[StepProblem]()
     rollout = simulate(
         NewtonStepper(potential, SETTINGS),
@@ -79,8 +84,13 @@ def systems(garment: str, motion: str, frames: int) -> Iterator[System]:
         observe=lambda index, problem, prediction: steps.append(problem),
     )
     deque(rollout, maxlen=0)
-    for problem in steps[STRIDE - 1 :: STRIDE]:
-        work = in_double(problem)
+    return [in_double(problem) for problem in steps[STRIDE - 1 :: STRIDE]]
+
+
+def systems(garment: str, motion: str, frames: int) -> Iterator[System]:
+    """Those of some steps of a rollout."""
+    potential = default_potential()
+    for work in steps_of(garment, motion, frames):
         system = CompiledSystem(potential, work, plan_for(work), SETTINGS.cg_iterations)
         system.begin(None)
         (scene,), number = system._engines, 0
@@ -232,13 +242,43 @@ def times(garment: str, motion: str, rounds: int = 7, count: int = 100) -> tuple
     return engine.values.num_rows, min(solves), min(matrices)
 
 
+def in_parts(garment: str, motion: str, frames: int, parts: list[int]) -> dict[str, int]:
+    """Iterations in one part and in others, of all systems of some steps of a rollout."""
+    potential, used = default_potential(), dict[str, int]()
+    for work in steps_of(garment, motion, frames):
+        system = CompiledSystem(potential, work, plan_for(work), SETTINGS.cg_iterations)
+        system.begin(None)
+        engine, right, found = system.engines[0], np.zeros(tuple(work.state.pos.shape)), np.zeros(tuple(work.state.pos.shape))
+        while (residual := system.model()[0]) > SETTINGS.target_rg:
+            right[engine.array("vertex")[: engine.values.num_rows]] = -engine.array("gradient")[:, :3]
+            for count, usual in [(1, False), *((count, usual) for count in parts for usual in (True, False))]:
+                engine.share(count)
+                engine.model()
+                engine.matrix()
+                engine.values.num_border *= not usual
+                before = engine.values.cg_used
+                engine.solve(right, float(np.clip(residual**0.5, *TOLERANCES)), SETTINGS.cg_iterations, found)
+                name = f"{count}, usual" if usual else f"{count}"
+                used[name] = used.get(name, 0) + engine.values.cg_used - before
+            engine.share(1)
+            if not (system.model() and system.move([residual], [True])[0]):
+                break
+    return used
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("garments", nargs="*", default=["dress", "dress_4k"])
     parser.add_argument("--motion", default="dance_mixed")
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--time", action="store_true", help="what an iteration takes")
+    parser.add_argument("--parts", type=int, nargs="+", help="iterations in so many parts")
     arguments = parser.parse_args()
+    if arguments.parts:
+        for garment in arguments.garments:
+            used = in_parts(garment, arguments.motion, arguments.frames, arguments.parts)
+            print(f"{garment:10}" + "".join(f"{name:>12} {count / used['1']:.2f}×" for name, count in used.items()), flush=True)
+        return
     if arguments.time:
         print(f"{'garment':10}{'free vertices':>15}{'iteration [µs]':>16}{'matrix [ms]':>13}")
         for garment in arguments.garments:

@@ -192,7 +192,8 @@ class Cloth:
     def edge_sq(self, pos: Tensor) -> Tensor:
         """Squares [m²] (E,) of the lengths of the edges at ``pos`` (V, 3) [m]."""
         start, end = self._ends
-        return (pos.index_select(0, end) - pos.index_select(0, start)).square().sum(dim=1)
+        square = (pos.index_select(0, end) - pos.index_select(0, start)).square()
+        return square[:, 0] + square[:, 1] + square[:, 2]  # sooner than a sum over rows of three, and the same bits
 
     def largest_of_edges(self, values: Tensor) -> Tensor:
         """The largest of ``values`` (E,) >= 0 among the edges at every vertex, (V,); 0 at isolated ones."""

@@ -58,15 +58,23 @@ class Potential:
 
         The problem itself where no term asks for more than it holds; contact that is there already is not searched again.
         """
-        known, terms = made_of(problem).get("prepared"), tuple(self.terms.values())
-        values = [value for term in terms for value in (term, *getattr(term, "__dict__", {}).values())]
-        if known is not None and known[0]() is problem and len(known[1]) == len(values) and all(map(is_, known[1], values)):
+        known = made_of(problem).get("prepared")
+        if known is not None and known[0]() is problem and self.is_as(known[1]):
             return problem
-        for term in terms:
+        for term in self.terms.values():
             problem = prepared(term, problem)
         problem = self.with_internal_force(problem)
-        made_of(problem)["prepared"] = weakref.ref(problem), values
+        made_of(problem)["prepared"] = weakref.ref(problem), self.parts()
         return problem
+
+    def parts(self) -> list[Any]:
+        """The terms and what they hold, for :meth:`is_as`."""
+        return [value for term in self.terms.values() for value in (term, *getattr(term, "__dict__", {}).values())]
+
+    def is_as(self, parts: list[Any]) -> bool:
+        """Whether the terms are the same objects as when ``parts`` were asked for, and hold the same."""
+        own = self.parts()
+        return len(own) == len(parts) and all(map(is_, own, parts))
 
     @torch.no_grad()
     def with_internal_force(self, problem: StepProblem, compiled: bool = True) -> StepProblem:

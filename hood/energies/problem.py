@@ -57,6 +57,13 @@ class StepProblem:
         """B."""
         return self.cloth.num_scenes
 
+    def versions(self) -> tuple[int, ...] | None:
+        """Numbers that change where state, what is prescribed, masses or gravity are changed in place; None where tensors do
+        not count their changes."""
+        given = self.cloth.mass, self.gravity, *vars(self.state).values(), *vars(self.step).values()
+        tensors = [value for value in given if isinstance(value, Tensor)]
+        return None if any(tensor.is_inference() for tensor in tensors) else tuple(tensor._version for tensor in tensors)
+
     def with_contact(self) -> StepProblem:
         """The problem with its contact, searched for at x_t; itself where that has been done or there is no body."""
         obstacle = self.step.obstacle

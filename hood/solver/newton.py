@@ -132,11 +132,20 @@ def minimize(
 
 
 @torch.no_grad()
-def first_guess(potential: Potential, problem: StepProblem, settings: NewtonSettings | None = None) -> tuple[Tensor, Tensor]:
+def first_guess(
+    potential: Potential, problem: StepProblem, settings: NewtonSettings | None = None, crossing: bool = False
+) -> tuple[Tensor, Tensor]:
     """Where :func:`minimize` starts by default, positions (V, 3) m and the accelerations (V, 3) m/s² that lead there, in the
-    problem's type; see :func:`hood.solver.system.iterate.first_iterate`."""
+    problem's type; see :func:`hood.solver.system.iterate.first_iterate`.
+
+    Args:
+        crossing: the way there may cross cloth where the step begins with no cloth near cloth, as :func:`minimize` starts: it
+            looks at the way to where it ends.
+    """
     problem = potential.prepare(problem)
     work = in_double(problem)
+    if crossing and not touching(layers_of(potential, work), work.state.pos):
+        potential = without_layers(potential)
     system = system_of(potential, work, plan_for(work), settings or NewtonSettings())
     system.begin(None)
     pos, acc = system.state()

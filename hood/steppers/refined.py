@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +35,8 @@ class GuessStepper:
     """The contact-projected inertial guess as a step: where the solver starts, and a refinement without a network.
 
     Vertices fly on, with their weight or without it, whichever has the lower potential, and are moved out of the body. Of the
-    ``settings`` it has the form of the solver.
+    ``settings`` it has the form of the solver. ``crossing``: as for :func:`hood.solver.newton.first_guess`; a
+    :class:`RefinedStepper` takes a copy of the stepper with it, and sees to crossings itself.
     """
 
     times: tuple[str, ...] = ("search", "guess", "rest", "total")
@@ -44,8 +45,8 @@ class GuessStepper:
     any_precision = True
     memoryless = True
 
-    def __init__(self, potential: Potential, settings: NewtonSettings | None = None) -> None:
-        self.potential, self.settings = potential, settings or NewtonSettings()
+    def __init__(self, potential: Potential, settings: NewtonSettings | None = None, crossing: bool = False) -> None:
+        self.potential, self.settings, self.crossing = potential, settings or NewtonSettings(), crossing
         self.gravity = torch.tensor([0.0, -9.81, 0.0])
         self.config: dict[str, Any] = {"stepper": "guess"}
 
@@ -62,7 +63,7 @@ class GuessStepper:
         with timed(watch, "search"):
             problem = self.search(problem)
         with timed(watch, "guess"):
-            return Prediction(*first_guess(self.potential, problem, self.settings))
+            return Prediction(*first_guess(self.potential, problem, self.settings, self.crossing))
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
@@ -74,7 +75,9 @@ class RefinedStepper:
 
     The potential of a step never rises: what an iteration leads to is kept where it is lower, and a step for which there is no
     such place stays, to the bit, what the inner stepper made of it. Where the potential keeps layers of cloth apart, a step
-    starts as near to what the inner stepper made of it as cloth does not cross cloth on the way. Pinned vertices stay on their
+    ends on this side of cloth: it is as near to what the inner stepper made of it as cloth does not cross cloth on the way, and
+    iterations begin there. Iterations of Newton's method in a given number begin beyond cloth, without layers, where the step
+    begins with no cloth near cloth, and again with layers if they end there. Pinned vertices stay on their
     targets. Of every frame the metrics hold ``refine_iterations`` (those that were kept), ``refine_rg`` (the relative gradient
     reached), ``refine_phi_before`` and ``refine_phi_after`` [J], ``refine_reason`` (the number of what ended it,
     :mod:`hood.solver.step_figures`) and what the goal reports; its time is ``ms_refine``. Where a goal wants no refinement of a
@@ -103,6 +106,9 @@ class RefinedStepper:
     ) -> None:
         if method not in METHODS:
             raise ValueError(f"method is {method!r}; choose {' or '.join(METHODS)}")
+        if isinstance(inner, GuessStepper):
+            inner = copy(inner)
+            inner.crossing = True
         self.inner, self.potential, self.goal, self.method = inner, potential, goal, method
         self._fresh_goal, self._minimizer = deepcopy(goal), minimizer
         self.settings = replace(settings or NewtonSettings(), target_rg=goal.accuracy, max_iterations=goal.most, budget_ms=None)
@@ -189,6 +195,11 @@ class RefinedStepper:
         pos = rounded(problem, prediction.next_pos)
         return Prediction(pos, problem.acceleration(pos), prediction.metrics)
 
+    @property
+    def _looks_at_end(self) -> bool:
+        """Whether iterations begin at the prediction, be it beyond cloth: ``minimize`` looks at the way to where they end."""
+        return self.method == "newton" and self._minimizer is None and not self.goal.decides
+
     def _apart(self, problem: StepProblem, prediction: Prediction) -> Prediction:
         """The prediction, as far as cloth does not cross cloth on the way there."""
         layers = layers_of(self.potential, problem)
@@ -202,10 +213,14 @@ class RefinedStepper:
 
     def _refine(self, problem: StepProblem, prediction: Prediction, elapsed: Callable[[], float]) -> Prediction:
         goal, nan = self.goal, float("nan")
-        prediction = self._apart(problem, prediction)
+        prediction = prediction if self._looks_at_end else self._apart(problem, prediction)
         reached = RefinementState(problem, prediction.next_pos, 0, nan, elapsed())
         before = after = reason = nan
-        if goal.begin(reached):
+        if not goal.begin(reached):
+            if self._looks_at_end:
+                prediction = self._apart(problem, prediction)
+                reached = RefinementState(problem, prediction.next_pos, 0, nan, elapsed())
+        else:
             prediction, history, reason = self._descend(problem, prediction, elapsed)
             before, after = _sum(history[0].phi), _sum(history[-1].phi)
             kept = sum(_sum(b.phi) < _sum(a.phi) for a, b in zip(history, history[1:], strict=False))
@@ -246,6 +261,8 @@ class RefinedStepper:
             )
             acc, history, reason = swept.acc, swept.history, reason_number(swept.reason)
         lower = history[-1].phi < history[0].phi
+        if self._looks_at_end and not bool(lower.all()):
+            prediction = self._apart(problem, prediction)
         if not bool(lower.any()):
             # Newton may move within the rounding of the potential; its first entry says what holds where it began.
             return replace(prediction, early=()), history[:1] if self.method == "newton" else history[-1:], reason

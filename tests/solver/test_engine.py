@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -163,6 +164,31 @@ def test_runs_are_bit_identical_whatever_came_between():
     assert torch.equal(minimize(default_potential(), problem, settings=COMPILED)[0], first)
     copy = replace(problem, cloth=to_device(problem.cloth, dtype=torch.float64), contact=problem.contact)
     assert torch.equal(minimize(default_potential(), copy, settings=COMPILED)[0], first)
+
+
+def test_what_is_read_of_a_step_is_kept_for_the_same_problem_and_terms():
+    potential, problem = default_potential(), touching_sheet()
+    known = potential.prepare(problem)
+    step = engine.compiled_step(potential, known)
+    assert engine.compiled_step(potential, known) is step
+    assert engine.compiled_step(potential.only(potential.terms), known) is step  # other potentials of the same terms
+    other = potential.with_terms(stretching=copy(potential.terms["stretching"]))
+    assert engine.compiled_step(other, known) is not step
+    assert engine.compiled_step(potential, replace(known, gravity=2.0 * known.gravity)) is not step
+
+
+@pytest.mark.parametrize("name", ["vel", "gravity", "dt", "mass"])
+def test_what_is_changed_in_place_is_seen(name):
+    potential, problem = default_potential(), hanging()
+    known = potential.prepare(problem)
+    before = minimize(potential, known, settings=COMPILED)[0]
+    tensors = {"vel": known.state.vel, "gravity": known.gravity, "dt": known.step.dt, "mass": known.cloth.mass}
+    tensors[name].mul_(2.0).add_(1e-3)
+    found = minimize(potential, known, settings=COMPILED)[0]
+    state = replace(known.state, vel=known.state.vel.clone())
+    fresh = replace(known, state=state, gravity=known.gravity.clone())
+    assert torch.equal(found, minimize(potential, fresh, settings=COMPILED)[0])
+    assert float((found - before).abs().max()) > 1e-5
 
 
 def test_pins_are_where_they_shall_be_and_a_changed_fabric_is_seen():

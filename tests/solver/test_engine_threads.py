@@ -100,6 +100,24 @@ def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
         assert np.abs(direction - moved[0]).max() <= 1e-10 * np.abs(moved[0]).max()
 
 
+def test_two_parts_take_hardly_more_linear_iterations_than_one(share):
+    """Blocks where parts meet are larger in the preconditioner, and there alone; otherwise two take 1.4 times as many."""
+    problem, count = hanging(40, 40, size=0.4), {}
+    pos = problem.state.pos + 2e-3 * torch.as_tensor(np.random.default_rng(0).normal(size=problem.state.pos.shape))
+    for name, parts in (("one", 1), ("two", 2), ("two of usual blocks", 2)):
+        share(parts)
+        scene = model_at(problem, default_potential(), pos, wide=False)
+        if name == "two of usual blocks":
+            scene.values.num_border = 0
+        before = scene.array("inverse").copy(), scene.array("block").copy()
+        assert scene.move(1e-3, 1000)
+        assert np.array_equal(scene.array("inverse"), before[0])
+        assert np.array_equal(scene.array("block"), before[1])
+        count[name] = scene.values.cg_used
+    assert count["two"] <= 1.2 * count["one"]
+    assert count["two of usual blocks"] >= 1.3 * count["one"]
+
+
 def test_calls_from_several_threads_of_python_do_not_disturb_each_other(share):
     share(3)
     problems = pieces()

@@ -15,10 +15,13 @@ from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerBarrier
 from hood.mesh.penetration.crossing import self_crossings
 from hood.scene.scene import RELAXING_DT
-from hood.steppers.network import NetworkStepper, build_simulator
+from hood.solver.derivatives.self_contact import approached, layers_of
+from hood.solver.newton import first_guess
+from hood.solver.step_figures import strain_metrics
+from hood.steppers.network import NetworkStepper, Prediction, build_simulator
 from hood.steppers.protocol import Relaxing
-from hood.steppers.refined import RefinedStepper
-from hood.steppers.stopping import Count
+from hood.steppers.refined import GuessStepper, RefinedStepper
+from hood.steppers.stopping import Count, MaxStrain
 from hood.testing import grid, make_problem
 
 pytestmark = pytest.mark.usefixtures("compiled_layers")
@@ -76,6 +79,52 @@ def test_a_prediction_through_cloth_is_refined_from_this_side_of_it(iterations: 
     if pinned:
         held = problem.cloth.pinned
         assert torch.equal(prediction.next_pos[held], problem.state.pos[held])
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 5])
+def test_a_guess_through_cloth_is_refined_from_this_side_of_it(iterations: int) -> None:
+    """Where a step begins apart, the way to the guess itself is not looked at, but to where the refinement ends."""
+    problem = sheets()
+    known = POTENTIAL.prepare(problem)
+    through, there = (first_guess(POTENTIAL, known, crossing=crossing)[0] for crossing in (True, False))
+    assert crossings(problem, through) > 10
+    assert crossings(problem, there) == under(there) == 0
+    alone = GuessStepper(POTENTIAL)
+    assert torch.equal(alone.predict(known, None).next_pos, there)
+    stepper = RefinedStepper(alone, POTENTIAL, Count(iterations))
+    prediction = stepper.predict(problem, stepper.prepare(problem.cloth, problem.cloth.rest_pos.numpy()))
+    assert crossings(problem, prediction.next_pos) == under(prediction.next_pos) == 0
+    assert not alone.crossing
+
+
+def test_a_refined_guess_on_a_free_way_takes_one_search_for_near_cloth() -> None:
+    problem = sheets()
+    problem = replace(problem, state=replace(problem.state, vel=0.0 * problem.state.vel))
+    stepper = RefinedStepper(GuessStepper(POTENTIAL), POTENTIAL, Count(3))
+    known = stepper.search(problem)
+    stepper.predict(known, stepper.prepare(problem.cloth, problem.cloth.rest_pos.numpy()))
+    assert known.layers[0].layers.work.searches == 1
+
+
+@pytest.mark.parametrize("floor", [0, 2])
+def test_a_goal_of_strain_sees_the_cloth_on_this_side_of_cloth(floor: int) -> None:
+    """One sheet shifted through the other is not strained; on this side of it, it is, and beyond the limit."""
+    problem = sheets()
+    shifted = problem.state.pos.clone()
+    shifted[81:, 1] -= 0.02
+
+    class Through(GuessStepper):
+        def predict(self, problem: StepProblem, prepared: None, watch: object = None) -> Prediction:
+            return Prediction(shifted, problem.acceleration(shifted))
+
+    known = POTENTIAL.prepare(problem)
+    there = approached(layers_of(POTENTIAL, known), shifted)
+    strains = [strain_metrics(problem.cloth, pos)["strain_p99"] for pos in (shifted, there)]
+    assert strains[0] < 0.5 * strains[1]
+    stepper = RefinedStepper(Through(POTENTIAL), POTENTIAL, MaxStrain(0.75 * strains[1], floor=floor))
+    prediction = stepper.predict(problem, stepper.prepare(problem.cloth, problem.cloth.rest_pos.numpy()))
+    assert prediction.metrics["refine_iterations"] > 0
+    assert crossings(problem, prediction.next_pos) == 0
 
 
 def test_several_steps_in_a_row_stay_apart() -> None:

@@ -8,6 +8,7 @@ gradients are float64; the matrix and the linear solver are float32, and float64
 from __future__ import annotations
 
 import ctypes
+import weakref
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,6 +39,7 @@ from hood.solver.derivatives.self_contact import grips_of, layers_of
 from hood.solver.derivatives.step_terms import PointForces, point_forces, stretch_rate
 from hood.solver.derivatives.vertices import VertexForces, known_forces, terms_without_form
 from hood.solver.system.iterate import fixed_positions
+from hood.tensors.batch import made_of
 
 #: Vertices of a part that is worth a thread: an iteration of conjugate gradients takes 20 us at 1,000 vertices.
 _ROWS = 400
@@ -70,6 +72,8 @@ class _Engine(ctypes.Structure):
         ),
         *fields("indefinite_share raised phi noise", REAL),
         *fields("cg_used parts reach", COUNT),
+        *fields("border outside border_blocks", POINTER),
+        *fields("num_border", COUNT),
         *fields("layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
         *fields("layer_grips others", POINTER),
@@ -181,7 +185,20 @@ class CompiledStep:
 
 
 def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
-    """The step ``problem``, in float64 and prepared, with the terms of ``potential``."""
+    """The step ``problem``, in float64 and prepared, with the terms of ``potential``; kept for the next one who asks with the
+    same problem: in a scene of float64 a guess, and the solver that goes on from there."""
+    made, versions = made_of(problem), problem.versions()
+    known = made.get("compiled step")
+    if known is not None and known[0]() is problem and known[1] == versions and potential.is_as(known[2]):
+        step: CompiledStep = known[3]
+        return step
+    step = _compiled_step(potential, problem)
+    if not step.others:  # these hold the problem itself
+        made["compiled step"] = weakref.ref(problem), versions, potential.parts(), step
+    return step
+
+
+def _compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
     active = potential.active(problem)
     hinges = [term.closed_form(problem) for term in having(active, Form.HINGES).values()]
     forces: VertexForces = known_forces(potential, problem)

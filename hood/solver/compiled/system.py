@@ -94,6 +94,7 @@ class CompiledScene:
         if key not in self._memory:
             self._memory[key] = self._working_memory()
         self._point(**self._memory[key])
+        self.values.num_border = len(self._memory[key]["border"])
 
     def _working_memory(self) -> dict[str, np.ndarray]:
         values, kind = self.values, np.float64 if self.wide else np.float32
@@ -108,6 +109,7 @@ class CompiledScene:
         }
         memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
         memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
+        memory |= self.tables.border(values.parts, kind)
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(), np.uint8)
         memory["hinge_model"] = np.zeros(values.num_hinges * self._lib.newton_hinge_record(), np.uint8)

@@ -61,6 +61,21 @@ class Tables:
         """How far a column is behind its row at most."""
         return int((self.cols - np.repeat(np.arange(self.num_rows), np.diff(self.row_starts))).max(initial=0))
 
+    def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
+        """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
+        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``."""
+        size = self.num_rows
+        rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
+        part = np.searchsorted(size * np.arange(1, parts) // parts, np.arange(size), side="right")
+        both, other = np.concatenate([rows, cols]), np.tile(part[rows] != part[cols], 2)
+        outside = np.bincount(both, other, size) / np.maximum(np.bincount(both, minlength=size) - 2, 1)  # but the diagonal
+        border = np.flatnonzero(outside)
+        return {
+            "border": border.astype(np.int32),
+            "outside": outside[border],
+            "border_blocks": np.zeros(24 * len(border), kind),
+        }
+
 
 def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> Tables:
     """Tables of one ``scene`` of a cloth and the attachments of its steps."""

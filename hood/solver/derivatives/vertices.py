@@ -154,6 +154,7 @@ class KnownForces(NamedTuple):
     """Forces of a step, the terms that they are of, and the names in the order of :meth:`VertexForces.energies`."""
 
     problem: weakref.ref[StepProblem]
+    versions: tuple[int, ...] | None
     terms: dict[str, Term]
     forces: VertexForces
     names: list[str] | None  # None where several terms are added up into one
@@ -171,11 +172,11 @@ def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
 @torch.no_grad()
 def known(potential: Potential, problem: StepProblem) -> KnownForces:
     """The same, with the terms that they are of."""
-    key, terms = id(problem), having(potential.terms, *VERTEX_FORMS)
+    key, versions, terms = id(problem), problem.versions(), having(potential.terms, *VERTEX_FORMS)
     last = _KNOWN.get(key)
-    if last is None or last.problem() is not problem or not _same(last.terms, terms):
+    if last is None or last.problem() is not problem or last.versions != versions or not _same(last.terms, terms):
         found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem), problem)
-        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), terms, found, names)
+        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), versions, terms, found, names)
     return last
 
 
@@ -261,7 +262,8 @@ def _single(
     potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor, slope: bool
 ) -> tuple[dict[str, Tensor], Tensor | None]:
     """Energies [J] (B,) by term of those that act on single vertices, and their gradient [N] (V, 3) where asked for."""
-    _, _, forces, names = known(potential, problem)
+    once = known(potential, problem)
+    forces, names = once.forces, once.names
     if names is None:
         alone = (potential.only({name: term}) for name, term in potential.active(problem).items())
         energies = {name: value for part in alone for name, value in _single(part, problem, pos, acc, slope=False)[0].items()}
