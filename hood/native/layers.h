@@ -134,12 +134,13 @@ struct Layers {
         Candidates candidates[2], beside[2];
         Listed listed[2], listed_beside[2];
         std::vector<uint64_t> released;
-        int64_t looked_at, crossed, told;  // of the candidates, how many the tally knows of
+        int64_t looked_at, crossed;
+        int64_t told;  // how many candidates the tally knows of
 
         int64_t count() const { return candidates[0].count + candidates[1].count + beside[0].count + beside[1].count; }
     };
     std::vector<std::array<int32_t, 2>> found_at;  // of the pairs that the last search has found of a kind
-    // Of all parts of a search together, now and then: one that finds too much ends early, in as many parts as it may be.
+    // What all parts of a search have found together, told after every so many pairs of faces: where that is too much, all end.
     struct Tally {
         std::atomic<int64_t> looked_at{0}, count{0};
         std::atomic<bool> over{false};

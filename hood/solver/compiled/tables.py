@@ -63,7 +63,8 @@ class Tables:
 
     def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
         """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
-        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``."""
+        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``. Parts are those of ``range_of``
+        in ``hood/native/threads.h``."""
         size = self.num_rows
         rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
         part = np.searchsorted(size * np.arange(1, parts) // parts, np.arange(size), side="right")
