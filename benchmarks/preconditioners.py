@@ -97,7 +97,7 @@ def systems(garment: str, motion: str, frames: int) -> Iterator[System]:
         while (residual := system.model()[0]) > SETTINGS.target_rg:
             scene.matrix()
             starts, cols, size = scene.array("row_starts"), scene.array("cols"), scene.values.num_rows
-            blocks = scene.array("matrix")[: 9 * len(cols)].reshape(-1, 3, 3).astype(np.float64)
+            blocks = scene.tables.blocks(scene.array("matrix")).astype(np.float64)
             above = np.repeat(np.arange(size), np.diff(starts)) != cols
             shape = (3 * size, 3 * size)
             upper = sparse.bsr_matrix((blocks, cols.copy(), starts.copy()), shape=shape)

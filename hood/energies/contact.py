@@ -73,7 +73,7 @@ class Walls:
 
     def take(self, rows: Tensor) -> Walls:
         """Those of some rows."""
-        weight = self.weight[rows] if isinstance(self.weight, Tensor) else self.weight
+        weight = self.weight[rows] if isinstance(self.weight, Tensor) and self.weight.ndim else self.weight
         return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
 
 

@@ -68,20 +68,20 @@ void model_layer_grips(const LayerGrips& g, int64_t num_vertices, const double* 
 }
 
 // Adds what pairs bring beside the diagonal blocks, with a share of the indefinite part, to q = H p: all that they bring, less those blocks.
-// Vertices from num_rows on do not move.
-template <class T> void couple_layer_grips(const LayerGrips& g, int64_t num_rows, double indefinite_share, const T* p, T* q) {
+// Vertices from num_rows on do not move; the others have a slot in p and q.
+template <class T> void couple_layer_grips(const LayerGrips& g, int64_t num_rows, const int32_t* slot, double indefinite_share, const T* p, T* q) {
     for (int64_t i = 0; i < g.count; ++i) {
         const double *model = g.model + 5 * i, *normal = g.normal + 3 * i, *weights = g.weights + 4 * i;
         const int32_t* corners = g.corners + 4 * i;
         double slip[3] = {0.0, 0.0, 0.0};
         for (int c = 0; c < 4; ++c)
-            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) slip[k] += weights[c] * (double)p[4 * (int64_t)corners[c] + k];
+            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) slip[k] += weights[c] * (double)p[4 * (int64_t)slot[corners[c]] + k];
         const double across = model[3] * dot3(slip, normal), along = indefinite_share * model[4] * dot3(slip, model);
         const double push[3] = {model[3] * slip[0] - across * normal[0] + along * model[0],
                                 model[3] * slip[1] - across * normal[1] + along * model[1],
                                 model[3] * slip[2] - across * normal[2] + along * model[2]};
         for (int c = 0; c < 4; ++c)
-            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) q[4 * (int64_t)corners[c] + k] += (T)(weights[c] * push[k]);
+            for (int k = 0; k < 3 && corners[c] < num_rows; ++k) q[4 * (int64_t)slot[corners[c]] + k] += (T)(weights[c] * push[k]);
     }
     constexpr int PLACE[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
     for (int64_t row = 0; row < num_rows; ++row) {
@@ -89,8 +89,8 @@ template <class T> void couple_layer_grips(const LayerGrips& g, int64_t num_rows
         if (own[0] == 0.0 && own[3] == 0.0 && own[5] == 0.0) continue;
         for (int a = 0; a < 3; ++a) {
             double push = 0.0;
-            for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + indefinite_share * less[PLACE[a][b]]) * (double)p[4 * row + b];
-            q[4 * row + a] -= (T)push;
+            for (int b = 0; b < 3; ++b) push += (own[PLACE[a][b]] + indefinite_share * less[PLACE[a][b]]) * (double)p[4 * (int64_t)slot[row] + b];
+            q[4 * (int64_t)slot[row] + a] -= (T)push;
         }
     }
 }

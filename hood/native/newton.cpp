@@ -4,8 +4,9 @@
 // the free ones first, in an order that keeps neighbours near each other, then the fixed ones. A table of triples is padded to four
 // numbers a row. Elements are taken as many at a time as a register holds, in float64; a row of 3 x 3 blocks is then gathered from the
 // elements at its vertex, in cache, and written once: no two writers, a fixed order, the same bits in every run. Of the symmetric
-// matrix a row keeps its diagonal block, which comes first, and those of later columns. Loops over elements and rows are shared by
-// threads where the cloth is large enough: in parts, each with its own sums, which are then added in their order.
+// matrix a row keeps its diagonal block, which comes first, and those of later columns; the linear system takes rows in pairs. Loops
+// over elements and rows are shared by threads where the cloth is large enough: in parts, each with its own sums, which are then added
+// in their order.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -13,22 +14,18 @@
 #include "element_laws.h"
 #include "layer_grips.h"
 #include "layer_view.h"
+#include "pairs.h"
 #include "threads.h"
 #include "vertex_terms.h"
 
 namespace {
 
 typedef double D4 __attribute__((vector_size(32)));
-typedef float F4 __attribute__((vector_size(16)));
 #ifdef WIDE  // a library of its own: few scenes need it
 typedef double Real;  // of the matrix and the linear solver
 #else
 typedef float Real;
 #endif
-
-template <class T> struct Four;
-template <> struct Four<float> { typedef F4 type; };
-template <> struct Four<double> { typedef D4 type; };
 
 }  // namespace
 
@@ -63,6 +60,10 @@ struct Engine {
     const int64_t* vertex;                        // (V) original number of each vertex
     const int32_t *face_corners, *hinge_corners;  // (3, F), (4, H)
     const int32_t *row_starts, *cols;             // (N + 1), (R) block rows and columns
+    // Rows of the linear system in pairs of no neighbours, P of them: a sliced ELLPACK format of two rows (Kreutzer et al. 2014).
+    int64_t num_pairs;
+    const int32_t *slot, *row_of_slot;            // (N) twice the pair, and 1 in its second half; (2 P), -1 where a half is empty
+    const int32_t *pair_starts, *pair_cols;       // (P + 1), (., 2) slots of the columns; where a row is shorter, its own
     // Elements at a row's vertex, those with the most blocks in the row first: (C N + 1) starts for elements of C corners, with
     // C, ..., 1 blocks; (., 1 + C) 4 element + corner, then 4 place in the row + corner of its blocks, the diagonal first.
     const int32_t *face_starts, *face_uses, *hinge_starts, *hinge_uses, *spring_starts, *spring_uses;
@@ -76,8 +77,8 @@ struct Engine {
     const double *face_rate, *face_before;    // (F), (3, F) Green strains
     const double *hinge_rate, *hinge_before;  // (H), (H) angles
     // The step.
-    const double *base, *fixed;  // (V, 3) m original: free flight, and where fixed vertices are
-    const double *inertia, *weight;  // (V) kg, (V, 3) N original
+    const double *base, *fixed;  // (V, 3) m: free flight, and where fixed vertices are
+    const double *inertia, *weight;  // (V) kg, (V, 3) N
     const double *spring_stiffness, *spring_target;  // (A) N/m, (A, 4) m: what the difference of the ends is drawn to
     const Wall* walls;
     const Grip* grips;
@@ -93,12 +94,13 @@ struct Engine {
     double *path;                   // (W, N, 8) stops of the line search: give, compliance, depth, of every wall
     double *face_force, *hinge_force;  // (F, 10), (H, 14) gradients by corner, then axis, and what loads of four read beyond
     void *face_model, *hinge_model; // records of the elements, see below, of float or double like the rest
-    void *matrix, *indefinite_part;           // (R, 9) + 1, (R)
+    void *matrix, *indefinite_part;           // (., 3, 2, 4) axis by half, of the blocks of pairs, and (R)
     void *own, *own_indefinite_part;          // (N, 6) what acts on single vertices
     void *row_sum;                  // (parts, most_blocks, 16), aligned to 32 bytes
-    void *block, *inverse, *x, *r, *z, *p, *q; // (N, 12) twice, (N, 4) five times
+    void *block, *inverse, *x, *r, *z, *p, *q; // (P, 3, 2, 4) twice, (P, 2, 4) five times; 0 in empty halves
     double indefinite_share, raised;       // of the matrix as it stands, and of the next one
     double phi, noise;
+    int64_t modelled;               // whether records and forces of the elements are those of the state
     int64_t cg_used;
     // Threads.
     int64_t parts, reach;           // in how many parts loops are done; how far a column is behind its row at most
@@ -119,6 +121,7 @@ struct Engine {
 namespace {
 
 inline Range rows_of(const Engine& e, int64_t part) { return range_of(e.num_rows, part, e.parts); }
+inline Range pairs_of(const Engine& e, int64_t part) { return range_of(e.num_pairs, part, e.parts); }
 inline Range faces_of(const Engine& e, int64_t part) { return range_of(e.num_faces, part, e.parts, AT_ONCE); }
 inline Range hinges_of(const Engine& e, int64_t part) { return range_of(e.num_hinges, part, e.parts, AT_ONCE); }
 
@@ -182,21 +185,28 @@ template <auto law_of> double face_energy(const Engine& e, const double* pos, Ra
     return sum;
 }
 
-template <class T> void face_models(const Engine& e, const double* pos, Range range) {
+// The records and forces at positions; the energy of the faces.
+template <class T> double face_models(const Engine& e, const double* pos, Range range) {
     FaceRecord<T>* records = (FaceRecord<T>*)e.face_model;
     const VN zero = every(0.0), one = every(1.0);
+    double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
         VN f[2][3];
         const Strain g = strain_of(e, pos, i, f);
+        const VN area = load<VN>(e.area + i);
         const auto stress = [&](const auto& law) {
             Stress s = stress_of(law, g, one);
+            sum += total(area * density_of(law, g));
             if (e.face_rate) {
-                const Stress viscous = stress_of(law, since_start(e, i, g), load<VN>(e.face_rate + i));
+                const VN rate = load<VN>(e.face_rate + i);
+                const Strain added = since_start(e, i, g);
+                const Stress viscous = stress_of(law, added, rate);
                 s.s00 += viscous.s00, s.s01 += viscous.s01, s.s11 += viscous.s11;
+                sum += total(area * rate * density_of(law, added));
             }
             return s;
         };
-        const VN area = load<VN>(e.area + i), stiffer = e.face_rate ? root(1.0 + load<VN>(e.face_rate + i)) : one;
+        const VN stiffer = e.face_rate ? root(1.0 + load<VN>(e.face_rate + i)) : one;
         const VN bulk = load<VN>(e.bulk + i) * stiffer, soft = load<VN>(e.soft + i) * stiffer;
         Weave weave;
         Stress s;
@@ -222,32 +232,31 @@ template <class T> void face_models(const Engine& e, const double* pos, Range ra
             pull0[c] = s.s00 * w0 + s.s01 * w1, pull1[c] = s.s01 * w0 + s.s11 * w1;
             ten0[c] = t00 * w0 + t01 * w1, ten1[c] = t01 * w0 + t11 * w1;
         }
-        for (int c = 0; c < 3; ++c) {
+        VN force[9], roots[28], axial[12];
+        for (int c = 0; c < 3; ++c)
             for (int k = 0; k < 3; ++k) {
-                const VN force = pull0[c] * f[0][k] + pull1[c] * f[1][k];
-                const VN along = b0[c] * f[0][k], across = b1[c] * f[1][k];
-                const VN turned = b0[c] * f[1][k] + b1[c] * f[0][k];
-                VN roots[3] = {bulk * (along + across), soft * (along - across), soft * turned};
+                const int at = 3 * c + k;
+                force[at] = pull0[c] * f[0][k] + pull1[c] * f[1][k];
+                const VN along = b0[c] * f[0][k], across = b1[c] * f[1][k], both = b0[c] * f[1][k] + b1[c] * f[0][k];
                 if (e.weave) {
-                    roots[0] = weave.first * along + weave.coupled * across;
-                    roots[1] = weave.second * across, roots[2] = weave.turn * turned;
-                }
-                for (int lane = 0; lane < AT_ONCE; ++lane) {
-                    e.face_force[10 * (i + lane) + 3 * c + k] = force[lane];
-                    for (int m = 0; m < 3; ++m) records[i + lane].root[9 * m + 3 * c + k] = (T)roots[m][lane];
+                    roots[at] = weave.first * along + weave.coupled * across;
+                    roots[9 + at] = weave.second * across, roots[18 + at] = weave.turn * both;
+                } else {
+                    roots[at] = bulk * (along + across), roots[9 + at] = soft * (along - across), roots[18 + at] = soft * both;
                 }
             }
-        }
+        roots[27] = zero;
         int place = 0;
         for (int c = 0; c < 3; ++c)
-            for (int d = c; d < 3; ++d, ++place) {
-                const VN axial = ten0[c] * b0[d] + ten1[c] * b1[d], indefinite_part = pull0[c] * b0[d] + pull1[c] * b1[d] - axial;
-                for (int lane = 0; lane < AT_ONCE; ++lane) {
-                    records[i + lane].axial[2 * place] = (T)axial[lane];
-                    records[i + lane].axial[2 * place + 1] = (T)indefinite_part[lane];
-                }
+            for (int d = c; d < 3; ++d, place += 2) {
+                axial[place] = ten0[c] * b0[d] + ten1[c] * b1[d];
+                axial[place + 1] = pull0[c] * b0[d] + pull1[c] * b1[d] - axial[place];
             }
+        store_by_lane<9, 10>(force, e.face_force + 10 * i);
+        store_by_lane<28, sizeof(FaceRecord<T>) / sizeof(T)>(roots, records[i].root);
+        store_by_lane<12, sizeof(FaceRecord<T>) / sizeof(T)>(axial, records[i].axial);
     }
+    return sum;
 }
 
 // The hinge in units of its edge at rest; returns how many of them make a metre.
@@ -276,9 +285,11 @@ double hinge_energy(const Engine& e, const double* pos, Range range) {
     return sum;
 }
 
-template <class T> void hinge_models(const Engine& e, const double* pos, Range range) {
+// The records and forces at positions; the energy of the hinges.
+template <class T> double hinge_models(const Engine& e, const double* pos, Range range) {
     HingeRecord<T>* records = (HingeRecord<T>*)e.hinge_model;
     const VN zero = every(0.0), one = every(1.0);
+    double sum = 0.0;
     for (int64_t i = range.begin; i < range.end; i += AT_ONCE) {
         Hinge h;
         VN offset[3][3], slope[4][3];
@@ -298,21 +309,20 @@ template <class T> void hinge_models(const Engine& e, const double* pos, Range r
             residual = bend_of(h.angle, load<VN>(e.rest_angle + i));
         }
         const VN weight = load<VN>(e.hinge_weight + i);
-        VN force = weight * residual, size = root(weight);
+        VN force = weight * residual, size = root(weight), pull[12], row[12];
+        sum += total(bending_energy(weight, residual));
         if (e.hinge_rate) {
-            const VN rate = load<VN>(e.hinge_rate + i);
-            force += rate * weight * bend_of(h.angle, load<VN>(e.hinge_before + i));
+            const VN rate = load<VN>(e.hinge_rate + i), added = bend_of(h.angle, load<VN>(e.hinge_before + i));
+            force += rate * weight * added;
             size *= root(1.0 + rate);
+            sum += total(bending_energy(rate * weight, added));
         }
         for (int c = 0; c < 4; ++c)
-            for (int k = 0; k < 3; ++k) {
-                const VN pull = force * slope[c][k], row = size * slope[c][k];
-                for (int lane = 0; lane < AT_ONCE; ++lane) {
-                    e.hinge_force[14 * (i + lane) + 3 * c + k] = pull[lane];
-                    records[i + lane].row[3 * c + k] = (T)row[lane];
-                }
-            }
+            for (int k = 0; k < 3; ++k) pull[3 * c + k] = force * slope[c][k], row[3 * c + k] = size * slope[c][k];
+        store_by_lane<12, 14>(pull, e.hinge_force + 14 * i);
+        store_by_lane<12, sizeof(HingeRecord<T>) / sizeof(T)>(row, records[i].row);
     }
+    return sum;
 }
 
 // ---- single vertices -----------------------------------------------------------------------------------------------------
@@ -371,12 +381,11 @@ inline bool add_drag(const Points& set, int64_t i, const double* pos, double* gr
 }
 
 inline void vertex_model(const Engine& e, int64_t row, double* gradient, double* upper, double* indefinite_part) {
-    const int64_t v = e.vertex[row];
-    const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * v;
-    for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[v] * acc[k] - weight[k];
+    const double *pos = e.pos + 4 * row, *acc = e.acc + 4 * row, *weight = e.weight + 3 * row;
+    for (int k = 0; k < 3; ++k) gradient[k] = e.inertia[row] * acc[k] - weight[k];
     for (int k = 0; k < 6; ++k) upper[k] = indefinite_part[k] = 0.0;
-    upper[0] = upper[3] = upper[5] = e.inertia[v] / e.dt_sq;
-    add_contact(e, v, pos, gradient, upper, indefinite_part);
+    upper[0] = upper[3] = upper[5] = e.inertia[row] / e.dt_sq;
+    add_contact(e, row, pos, gradient, upper, indefinite_part);
 }
 
 // ---- points inside edges and faces ---------------------------------------------------------------------------------------
@@ -492,37 +501,35 @@ template <class T> void couple_layers(const Engine& e) {
 
 void place(const Engine& e, const double* acc, double* pos) {
     for (int64_t row = 0; row < e.num_rows; ++row) {
-        const double* base = e.base + 3 * e.vertex[row];
+        const double* base = e.base + 3 * row;
         for (int k = 0; k < 3; ++k) pos[4 * row + k] = base[k] + e.dt_sq * acc[4 * row + k];
     }
 }
 
-// Potential at a placed state, and the rounding it is known to.
-void energy(const Engine& e, const double* pos, const double* acc, double* phi, double* noise) {
+// Potential at a placed state, and the rounding it is known to; with the elements' models there, which cost little more.
+void energy(const Engine& e, const double* pos, const double* acc, bool model, double* phi, double* noise) {
     double inertia = 0.0, gravity = 0.0, sum = 0.0, size = 0.0;
     for (int64_t row = 0; row < e.num_rows; ++row) {
-        const int64_t v = e.vertex[row];
-        inertia += 0.5 * e.inertia[v] * e.dt_sq * dot3(acc + 4 * row, acc + 4 * row);
-        gravity -= dot3(e.weight + 3 * v, pos + 4 * row);
+        inertia += 0.5 * e.inertia[row] * e.dt_sq * dot3(acc + 4 * row, acc + 4 * row);
+        gravity -= dot3(e.weight + 3 * row, pos + 4 * row);
     }
     for (int64_t row = e.num_rows; row < e.num_vertices; ++row) {
-        const int64_t v = e.vertex[row];
         double moved[3];
-        for (int k = 0; k < 3; ++k) moved[k] = pos[4 * row + k] - e.base[3 * v + k];
-        inertia += 0.5 * e.inertia[v] / e.dt_sq * dot3(moved, moved);
-        gravity -= dot3(e.weight + 3 * v, pos + 4 * row);
+        for (int k = 0; k < 3; ++k) moved[k] = pos[4 * row + k] - e.base[3 * row + k];
+        inertia += 0.5 * e.inertia[row] / e.dt_sq * dot3(moved, moved);
+        gravity -= dot3(e.weight + 3 * row, pos + 4 * row);
     }
     const auto add = [&](double part) { sum += part, size += std::fabs(part); };
     add(inertia);
     add(gravity);
     for (int64_t w = 0; w < e.num_walls; ++w) {
         double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) part += wall_energy(e.walls[w], e.vertex[row], pos + 4 * row);
+        for (int64_t row = 0; row < e.num_vertices; ++row) part += wall_energy(e.walls[w], row, pos + 4 * row);
         add(part);
     }
     for (int64_t w = 0; w < e.num_grips; ++w) {
         double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) part += grip_energy(e.grips[w], e.vertex[row], pos + 4 * row);
+        for (int64_t row = 0; row < e.num_vertices; ++row) part += grip_energy(e.grips[w], row, pos + 4 * row);
         add(part);
     }
     for (int64_t s = 0; s < e.num_points; ++s) {
@@ -547,8 +554,9 @@ void energy(const Engine& e, const double* pos, const double* acc, double* phi, 
     }
     Sums<double> faces, hinges;
     for_parts(e.parts, [&](int64_t part) {
-        if (e.membrane) faces[part] = (e.weave ? face_energy<weave_of> : face_energy<isotropic_of>)(e, pos, faces_of(e, part));
-        if (e.bending) hinges[part] = hinge_energy(e, pos, hinges_of(e, part));
+        const auto face_sum = model ? face_models<Real> : e.weave ? face_energy<weave_of> : face_energy<isotropic_of>;
+        if (e.membrane) faces[part] = face_sum(e, pos, faces_of(e, part));
+        if (e.bending) hinges[part] = (model ? hinge_models<Real> : hinge_energy)(e, pos, hinges_of(e, part));
     });
     if (e.membrane) add(faces.total(e.parts));
     if (e.bending) add(hinges.total(e.parts));
@@ -609,9 +617,10 @@ template <class T> void gather_gradient(const Engine& e, Range range, bool near)
 template <class T> struct Row {
     typedef typename Four<T>::type V4;
     V4 *axial, *block;  // of every block what is added to its diagonal and the indefinite part of that, and its three rows
+    V4 own_axial, own[3];  // the same of the block on the diagonal: all elements add to it, and memory would be waited for
 };
 
-// Faces with as many BLOCKS in the row.
+// Faces with as many BLOCKS in the row, the first on its diagonal.
 template <class T, int BLOCKS> inline void add_faces(const Engine& e, int64_t from, int64_t to, Row<T>& row) {
     typedef typename Four<T>::type V4;
     for (int64_t i = from; i < to; ++i) {
@@ -619,14 +628,16 @@ template <class T, int BLOCKS> inline void add_faces(const Engine& e, int64_t fr
         const FaceRecord<T>& face = ((const FaceRecord<T>*)e.face_model)[use[0] >> 2];
         const int c = use[0] & 3;
         const T* own = face.root + 3 * c;
-        for (int b = 0; b < BLOCKS; ++b) {
-            const int d = use[1 + b] & 3;
-            const int64_t place = use[1 + b] >> 2;
+        const auto add = [&](int d, V4* target, V4& axial) {
             const T* other = face.root + 3 * d;
             const V4 first = load<V4>(other), second = load<V4>(other + 9), third = load<V4>(other + 18);
-            V4* target = row.block + 3 * place;
             for (int k = 0; k < 3; ++k) target[k] += own[k] * first + own[9 + k] * second + own[18 + k] * third;
-            row.axial[place] += load<V4>(face.axial + 2 * PAIR[c][d]);
+            axial += load<V4>(face.axial + 2 * PAIR[c][d]);
+        };
+        add(c, row.own, row.own_axial);
+        for (int b = 1; b < BLOCKS; ++b) {
+            const int64_t place = use[1 + b] >> 2;
+            add(use[1 + b] & 3, row.block + 3 * place, row.axial[place]);
         }
     }
 }
@@ -637,50 +648,64 @@ template <class T, int BLOCKS> inline void add_hinges(const Engine& e, int64_t f
         const int32_t* use = e.hinge_uses + 5 * i;
         const HingeRecord<T>& hinge = ((const HingeRecord<T>*)e.hinge_model)[use[0] >> 2];
         const T* own = hinge.row + 3 * (use[0] & 3);
-        for (int b = 0; b < BLOCKS; ++b) {
-            const V4 other = load<V4>(hinge.row + 3 * (use[1 + b] & 3));
-            V4* target = row.block + 3 * (int64_t)(use[1 + b] >> 2);
+        const auto add = [&](int d, V4* target) {
+            const V4 other = load<V4>(hinge.row + 3 * d);
             for (int k = 0; k < 3; ++k) target[k] += own[k] * other;
-        }
+        };
+        add(use[0] & 3, row.own);
+        for (int b = 1; b < BLOCKS; ++b) add(use[1 + b] & 3, row.block + 3 * (int64_t)(use[1 + b] >> 2));
     }
 }
 
-// A symmetric block and its inverse by cofactors, scaled to a diagonal of ones first; rows of four numbers.
-template <class T, class V4> inline void invert(const V4* m, T* block, T* inverse) {
-    for (int i = 0; i < 3; ++i) store(block + 4 * i, m[i]);
-    double scale[3], a[3][3], c[3][3];
-    for (int i = 0; i < 3; ++i) scale[i] = 1.0 / std::sqrt(m[i][i] > T(0) ? (double)m[i][i] : 2.2250738585072014e-308);
-    for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) a[i][j] = (double)m[i][j] * scale[i] * scale[j];
-    for (int i = 0; i < 3; ++i) {
-        const double *u = a[(i + 1) % 3], *v = a[(i + 2) % 3];
-        c[i][0] = u[1] * v[2] - u[2] * v[1], c[i][1] = u[2] * v[0] - u[0] * v[2], c[i][2] = u[0] * v[1] - u[1] * v[0];
-    }
-    double determinant = dot3(a[0], c[0]);
-    if (!(determinant > 2.220446049250313e-16)) determinant = 2.220446049250313e-16;
-    const double share = 1.0 / determinant;
-    for (int i = 0; i < 3; ++i) {
-        const double by = share * scale[i];
-        store(inverse + 4 * i, V4{(T)(c[i][0] * by * scale[0]), (T)(c[i][1] * by * scale[1]), (T)(c[i][2] * by * scale[2]), T(0)});
+// Where the first block of a row is in the matrix, and its own block in arrays of one block a row.
+template <class T> inline T* blocks_of(const Engine& e, T* matrix, int64_t row) {
+    return matrix + 24 * (int64_t)e.pair_starts[e.slot[row] >> 1] + 4 * (e.slot[row] & 1);
+}
+template <class T> inline T* own_block(const Engine& e, T* blocks, int64_t row) { return blocks + 24 * (int64_t)(e.slot[row] >> 1) + 4 * (e.slot[row] & 1); }
+
+// The inverse ones of the symmetric blocks of rows, by cofactors, scaled to a diagonal of ones first; many rows at a time.
+template <class T> void invert_blocks(const Engine& e, Range range) {
+    constexpr int AXES[6][2] = {{0, 0}, {0, 1}, {0, 2}, {1, 1}, {1, 2}, {2, 2}};
+    for (int64_t row = range.begin; row < range.end; row += AT_ONCE) {
+        const T* block[AT_ONCE];
+        T* inverse[AT_ONCE];
+        for (int lane = 0; lane < AT_ONCE; ++lane) {
+            const int64_t at = std::min(row + lane, range.end - 1);
+            block[lane] = own_block(e, (const T*)e.block, at), inverse[lane] = own_block(e, (T*)e.inverse, at);
+        }
+        VN m[6], a[6], scale[3];
+        for (int k = 0; k < 6; ++k) m[k] = gather([&](int lane) { return (double)block[lane][8 * AXES[k][0] + AXES[k][1]]; });
+        for (int i = 0; i < 3; ++i) {
+            const VN own = m[PAIR[i][i]];
+            scale[i] = 1.0 / root(own > 0.0 ? own : every(2.2250738585072014e-308));
+        }
+        for (int k = 0; k < 6; ++k) a[k] = m[k] * scale[AXES[k][0]] * scale[AXES[k][1]];
+        VN c[6] = {a[3] * a[5] - a[4] * a[4], a[2] * a[4] - a[1] * a[5], a[1] * a[4] - a[2] * a[3],
+                   a[0] * a[5] - a[2] * a[2], a[1] * a[2] - a[0] * a[4], a[0] * a[3] - a[1] * a[1]};
+        VN determinant = a[0] * c[0] + a[1] * c[1] + a[2] * c[2];
+        determinant = determinant > 2.220446049250313e-16 ? determinant : every(2.220446049250313e-16);
+        for (int k = 0; k < 6; ++k) c[k] = c[k] / determinant * scale[AXES[k][0]] * scale[AXES[k][1]];
+        for (int lane = 0; lane < AT_ONCE; ++lane)
+            for (int i = 0; i < 3; ++i)
+                store(inverse[lane] + 8 * i, typename Four<T>::type{(T)c[PAIR[i][0]][lane], (T)c[PAIR[i][1]][lane], (T)c[PAIR[i][2]][lane], T(0)});
     }
 }
 
 // The upper rows of blocks, with a share of the indefinite part, and the inverse diagonal blocks of the matrix without it.
 template <class T> void gather_matrix(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
-    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *block = (T*)e.block, *inverse = (T*)e.inverse;
+    T *matrix = (T*)e.matrix, *indefinite_part = (T*)e.indefinite_part, *block = (T*)e.block;
     const T indefinite_share = (T)e.indefinite_share;
     const V4 unit[3] = {V4{1, 0, 0, 0}, V4{0, 1, 0, 0}, V4{0, 0, 1, 0}};
     V4* memory = (V4*)e.row_sum + 4 * e.most_blocks * part;
-    Row<T> sum = {memory, memory + e.most_blocks};
+    Row<T> sum = {memory, memory + e.most_blocks, V4{}, {}};
+    for (int64_t i = 0; i < 4 * e.most_blocks; ++i) memory[i] = V4{};
     const Range range = rows_of(e, part);
-    const int64_t end = e.row_starts[range.end];
     for (int64_t row = range.begin; row < range.end; ++row) {
         const int64_t start = e.row_starts[row], degree = e.row_starts[row + 1] - start;
-        for (int64_t i = 0; i < 3 * degree; ++i) sum.block[i] = V4{};
-        for (int64_t i = 0; i < degree; ++i) sum.axial[i] = V4{};
         const T *own = (const T*)e.own + 6 * row, *own_indefinite_part = (const T*)e.own_indefinite_part + 6 * row;
-        for (int k = 0; k < 3; ++k) sum.block[k] = V4{own[PAIR[k][0]], own[PAIR[k][1]], own[PAIR[k][2]], T(0)};
+        for (int k = 0; k < 3; ++k) sum.own[k] = V4{own[PAIR[k][0]], own[PAIR[k][1]], own[PAIR[k][2]], T(0)};
+        sum.own_axial = V4{};
         if (e.membrane) {
             const int32_t* starts = e.face_starts + 3 * row;
             add_faces<T, 3>(e, starts[0], starts[1], sum);
@@ -697,7 +722,7 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
         for (int64_t i = e.spring_starts[2 * row]; i < e.spring_starts[2 * (row + 1)]; ++i) {
             const int32_t* use = e.spring_uses + 3 * i;
             const T stiffness = (T)e.spring_stiffness[use[0] >> 2];
-            sum.axial[0] += V4{stiffness, T(0), T(0), T(0)};
+            sum.own_axial += V4{stiffness, T(0), T(0), T(0)};
             if (i < e.spring_starts[2 * row + 1]) sum.axial[use[2] >> 2] += V4{-stiffness, T(0), T(0), T(0)};
         }
         couple_points(e, row, [&](int32_t place, double factor, const double* m, const double* less) {
@@ -705,33 +730,36 @@ template <class T> void gather_matrix(const Engine& e, int64_t part) {
                 for (int j = 0; j < 3; ++j)
                     sum.block[3 * place + k][j] += (T)(factor * (m[PAIR[k][j]] + e.indefinite_share * less[PAIR[k][j]]));
         });
-        for (int k = 0; k < 3; ++k) sum.block[k] += sum.axial[0][0] * unit[k];
-        invert<T>(sum.block, block + 12 * row, inverse + 12 * row);
-        for (int k = 0; k < 3; ++k)
-            sum.block[k] += indefinite_share * V4{own_indefinite_part[PAIR[k][0]], own_indefinite_part[PAIR[k][1]], own_indefinite_part[PAIR[k][2]], T(0)};
-        sum.axial[0][0] = T(0);
-        for (int64_t i = 0; i < degree; ++i) {
-            T* target = matrix + 9 * (start + i);
+        for (int k = 0; k < 3; ++k) sum.own[k] += sum.own_axial[0] * unit[k];
+        for (int k = 0; k < 3; ++k) store(own_block(e, block, row) + 8 * k, sum.own[k]);
+        T* target = blocks_of(e, matrix, row);
+        const T axial = indefinite_share * sum.own_axial[1];
+        for (int k = 0; k < 3; ++k) {
+            const V4 less = {own_indefinite_part[PAIR[k][0]], own_indefinite_part[PAIR[k][1]], own_indefinite_part[PAIR[k][2]], T(0)};
+            store(target + 8 * k, sum.own[k] + indefinite_share * less + axial * unit[k]);
+        }
+        indefinite_part[start] = sum.own_axial[1];
+        for (int64_t i = 1; i < degree; ++i) {
+            target += 24;
             const T axial = sum.axial[i][0] + indefinite_share * sum.axial[i][1];
-            for (int k = 0; k < 2; ++k) store(target + 3 * k, sum.block[3 * i + k] + axial * unit[k]);
-            const V4 third = sum.block[3 * i + 2] + axial * unit[2];
-            if (start + i + 1 < end) store(target + 6, third);  // the fourth number is overwritten by the next store
-            else std::memcpy(target + 6, &third, 3 * sizeof(T));  // it would be another part's
-            indefinite_part[start + i] = sum.axial[i][1];
+            for (int k = 0; k < 3; ++k) store(target + 8 * k, sum.block[3 * i + k] + axial * unit[k]), sum.block[3 * i + k] = V4{};
+            indefinite_part[start + i] = sum.axial[i][1], sum.axial[i] = V4{};
         }
     }
+    invert_blocks<T>(e, range);
 }
 
 template <class T> void gather_matrix(const Engine& e) {
     for_parts(e.parts, [&](int64_t part) { gather_matrix<T>(e, part); });
 }
 
-template <class T> void differentiate(const Engine& e) {
+template <class T> void differentiate(Engine& e) {
     for_parts(e.parts, [&](int64_t part) {
-        if (e.membrane) face_models<T>(e, e.pos, faces_of(e, part));
-        if (e.bending) hinge_models<T>(e, e.pos, hinges_of(e, part));
+        if (e.membrane && !e.modelled) face_models<T>(e, e.pos, faces_of(e, part));
+        if (e.bending && !e.modelled) hinge_models<T>(e, e.pos, hinges_of(e, part));
         for (int64_t s = 0; s < e.num_points; ++s) point_models(e.points[s], e.pos, range_of(e.points[s].count, part, e.parts));
     });
+    e.modelled = true;
     const bool near = model_layers(e);
     if (e.layer_grips) model_layer_grips(*e.layer_grips, e.num_vertices, e.pos);
     if (e.others) e.others->model(e.pos);
@@ -746,18 +774,21 @@ template <class T> void sharpen(Engine& e, double indefinite_share) {
     if (change == T(0)) return;
     for_parts(e.parts, [&](int64_t part) {
         const Range range = rows_of(e, part);
-        for (int64_t i = e.row_starts[range.begin]; i < e.row_starts[range.end]; ++i)
-            for (int k = 0; k < 3; ++k) matrix[9 * i + 4 * k] += change * indefinite_part[i];
+        for (int64_t row = range.begin; row < range.end; ++row) {
+            T* block = blocks_of(e, matrix, row);
+            for (int64_t i = e.row_starts[row]; i < e.row_starts[row + 1]; ++i, block += 24)
+                for (int k = 0; k < 3; ++k) block[9 * k] += change * indefinite_part[i];
+        }
         if (e.num_grips || e.num_points || e.layer_grips)
             for (int64_t row = range.begin; row < range.end; ++row)
                 for (int a = 0; a < 3; ++a)
                     for (int b = 0; b < 3; ++b)
-                        matrix[9 * (int64_t)e.row_starts[row] + 3 * a + b] += change * own_indefinite_part[6 * row + PAIR[a][b]];
+                        blocks_of(e, matrix, row)[8 * a + b] += change * own_indefinite_part[6 * row + PAIR[a][b]];
         for (int64_t row = range.begin; row < range.end && e.num_points; ++row)
             couple_points(e, row, [&](int32_t place, double factor, const double*, const double* less) {
-                T* block = matrix + 9 * ((int64_t)e.row_starts[row] + place);
+                T* block = blocks_of(e, matrix, row) + 24 * (int64_t)place;
                 for (int a = 0; a < 3; ++a)
-                    for (int b = 0; b < 3; ++b) block[3 * a + b] += change * (T)(factor * less[PAIR[a][b]]);
+                    for (int b = 0; b < 3; ++b) block[8 * a + b] += change * (T)(factor * less[PAIR[a][b]]);
             });
     });
 }
@@ -770,81 +801,87 @@ template <class T> void sharpen(Engine& e, double indefinite_share) {
 // preconditioner B (Eisenstat 1981): an iteration goes through the blocks once backwards and once forwards, and there is no
 // product with H beside. Threads sweep over parts of their own; what couples the parts, and cloth with near cloth, is in H alone.
 
-// The sums of the first three numbers of each of three vectors.
-template <class V4> inline V4 sum_axes(V4 a, V4 b, V4 c) {
-#if defined(__clang__) || __GNUC__ >= 12
-    const V4 none = {}, low = __builtin_shufflevector(a, b, 0, 4, 1, 5), high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
-    const V4 other_low = __builtin_shufflevector(c, none, 0, 4, 1, 5), other_high = __builtin_shufflevector(c, none, 2, 6, 3, 7);
-    const V4 x = __builtin_shufflevector(low, other_low, 0, 1, 4, 5), y = __builtin_shufflevector(low, other_low, 2, 3, 6, 7);
-    return (x + y) + __builtin_shufflevector(high, other_high, 0, 1, 4, 5);
-#else
-    return V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], 0};
-#endif
+template <class T, class V8> inline V8 by_block(const T* m, V8 v) {
+    return load<V8>(m) * spread<0>(v) + load<V8>(m + 8) * spread<1>(v) + load<V8>(m + 16) * spread<2>(v);
 }
 
-template <class T, class V4> inline V4 by_block(const T* m, V4 v) { return load<V4>(m) * v[0] + load<V4>(m + 4) * v[1] + load<V4>(m + 8) * v[2]; }
+// Adds the products of the first numbers of a pair, then those of the second.
+template <class V8> inline void add_product(D4& sum, V8 a, V8 b) {
+    const V8 product = a * b;
+    sum += __builtin_convertvector(first_of(product), D4);
+    sum += __builtin_convertvector(second_of(product), D4);
+}
 
-// p' = z + share p', p from it, and (D - B) p + U p in the place of z, of some rows of a part that ends at a row.
+// p' = z + share p', p from it, and (D - B) p + U p in the place of z, of some pairs of a part that ends at a slot.
 template <class T, bool INSIDE> inline void sweep_back(const Engine& e, Range range, int64_t end, T share) {
     typedef typename Four<T>::type V4;
+    typedef typename Pair<T>::type V8;
     const T *matrix = (const T*)e.matrix, *inverse = (const T*)e.inverse;
     T *p = (T*)e.p, *q = (T*)e.q, *turned = (T*)e.z;
-    const int32_t *cols = e.cols, *starts = e.row_starts;
-    for (int64_t row = range.end - 1; row >= range.begin; --row) {
-        const V4 along = load<V4>(q + 4 * row) + share * load<V4>(turned + 4 * row);
-        store(turned + 4 * row, along);
-        V4 a = V4{}, b = V4{}, c = V4{};
-        const int64_t first = starts[row];
-        const T *own = matrix + 9 * first, *m = matrix + 9 * (int64_t)starts[row + 1];
+    const int32_t *cols = e.pair_cols, *starts = e.pair_starts;
+    const V4 none = V4{};
+    for (int64_t pair = range.end - 1; pair >= range.begin; --pair) {
+        const V8 along = load<V8>(q + 8 * pair) + share * load<V8>(turned + 8 * pair);
+        store(turned + 8 * pair, along);
+        V8 a = V8{}, b = V8{}, c = V8{};
+        const int64_t first = starts[pair];
+        const T *own = matrix + 24 * first, *m = matrix + 24 * (int64_t)starts[pair + 1];
 #pragma GCC unroll 4
-        for (const int32_t* col = cols + starts[row + 1] - 1; col > cols + first; --col) {
-            m -= 9;
-            if (!INSIDE && *col >= end) continue;
-            const V4 other = load<V4>(p + 4 * (int64_t)*col);
-            a += load<V4>(m) * other, b += load<V4>(m + 3) * other, c += load<V4>(m + 6) * other;
+        for (const int32_t* col = cols + 2 * (int64_t)starts[pair + 1] - 2; col > cols + 2 * first; col -= 2) {
+            m -= 24;
+            const T *one = p + 4 * (int64_t)col[0], *two = p + 4 * (int64_t)col[1];
+            if (!INSIDE) one = col[0] < end ? one : (const T*)&none, two = col[1] < end ? two : (const T*)&none;
+            const V8 other = load_both(one, two);
+            a = a + load<V8>(m) * other, b = b + load<V8>(m + 8) * other, c = c + load<V8>(m + 16) * other;
         }
-        const V4 above = sum_axes(a, b, c), rest = along - above;
-        const V4 step = by_block<T>(inverse + 12 * row, rest);
-        store(p + 4 * row, step);
-        store(q + 4 * row, load<V4>(own) * step[0] + load<V4>(own + 3) * step[1] + load<V4>(own + 6) * step[2] + above - rest);
+        const V8 above = sum_axes(a, b, c), rest = along - above;
+        const V8 step = by_block<T>(inverse + 24 * pair, rest);
+        store(p + 8 * pair, step);
+        store(q + 8 * pair, by_block<T>(own, step) + above - rest);
     }
 }
 
 // q = p + (B + L)^-1 q of a part; their p' . q.
 template <class T, bool FROM_ZERO, bool INSIDE> inline D4 sweep_on(const Engine& e, Range range) {
     typedef typename Four<T>::type V4;
+    typedef typename Pair<T>::type V8;
     const T *matrix = (const T*)e.matrix, *inverse = (const T*)e.inverse, *p = (const T*)e.p, *turned = (const T*)e.z;
     T* q = (T*)e.q;
-    const int32_t *cols = e.cols, *starts = e.row_starts;
+    const int32_t *cols = e.pair_cols, *starts = e.pair_starts;
     D4 sum = D4{};
-    for (int64_t row = range.begin; row < range.end; ++row) {
-        const V4 step = by_block<T>(inverse + 12 * row, load<V4>(q + 4 * row));
-        const V4 x = V4{} + step[0], y = V4{} + step[1], z = V4{} + step[2];
-        const T* m = matrix + 9 * (int64_t)starts[row];
-        const int32_t* end = cols + starts[row + 1];
+    const auto take = [&](int32_t col, V4 less) {
+        if (!INSIDE && col >= 2 * range.end) return;
+        T* target = q + 4 * (int64_t)col;
+        store(target, load<V4>(target) - less);
+    };
+    for (int64_t pair = range.begin; pair < range.end; ++pair) {
+        const V8 step = by_block<T>(inverse + 24 * pair, load<V8>(q + 8 * pair));
+        const V8 x = spread<0>(step), y = spread<1>(step), z = spread<2>(step);
+        const T* m = matrix + 24 * (int64_t)starts[pair];
+        const int32_t* end = cols + 2 * (int64_t)starts[pair + 1];
 #pragma GCC unroll 4
-        for (const int32_t* col = cols + starts[row] + 1; col < end; ++col) {
-            if (!INSIDE && *col >= range.end) break;
-            m += 9;
-            T* target = q + 4 * (int64_t)*col;
-            store(target, load<V4>(target) - (load<V4>(m) * x + load<V4>(m + 3) * y + load<V4>(m + 6) * z));
+        for (const int32_t* col = cols + 2 * (int64_t)starts[pair] + 2; col < end; col += 2) {
+            m += 24;
+            const V8 less = load<V8>(m) * x + load<V8>(m + 8) * y + load<V8>(m + 16) * z;
+            take(col[0], first_of(less));
+            take(col[1], second_of(less));
         }
-        const V4 product = FROM_ZERO ? step : load<V4>(p + 4 * row) + step;
-        store(q + 4 * row, product);
-        if (!FROM_ZERO) sum += __builtin_convertvector(product * load<V4>(turned + 4 * row), D4);
+        const V8 product = FROM_ZERO ? step : load<V8>(p + 8 * pair) + step;
+        store(q + 8 * pair, product);
+        if (!FROM_ZERO) add_product(sum, product, load<V8>(turned + 8 * pair));
     }
     return sum;
 }
 
 template <class T, bool FROM_ZERO> inline D4 sweep_on(const Engine& e, Range range) {
-    return range.end == e.num_rows ? sweep_on<T, FROM_ZERO, true>(e, range) : sweep_on<T, FROM_ZERO, false>(e, range);
+    return range.end == e.num_pairs ? sweep_on<T, FROM_ZERO, true>(e, range) : sweep_on<T, FROM_ZERO, false>(e, range);
 }
 
 template <class T> void sweep_back(const Engine& e, int64_t part, T share) {
-    const Range range = rows_of(e, part);
+    const Range range = pairs_of(e, part);
     const int64_t inside = e.parts == 1 ? range.end : std::max(range.begin, range.end - e.reach);
-    sweep_back<T, false>(e, {inside, range.end}, range.end, share);
-    sweep_back<T, true>(e, {range.begin, inside}, range.end, share);
+    sweep_back<T, false>(e, {inside, range.end}, 2 * range.end, share);
+    sweep_back<T, true>(e, {range.begin, inside}, 2 * range.end, share);
 }
 
 // Adds to q of a part what the blocks between it and other parts make of p.
@@ -852,62 +889,64 @@ template <class T> void couple_part(const Engine& e, Range range) {
     typedef typename Four<T>::type V4;
     T* q = (T*)e.q;
     const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
-    for (int64_t row = std::max<int64_t>(range.begin - e.reach, 0); row < range.begin; ++row) {
-        const V4 own = load<V4>(p + 4 * row);
-        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.begin; --i) {
-            if (e.cols[i] >= range.end) continue;
-            const T* m = matrix + 9 * (int64_t)i;
-            T* target = q + 4 * (int64_t)e.cols[i];
-            store(target, load<V4>(target) + load<V4>(m) * own[0] + load<V4>(m + 3) * own[1] + load<V4>(m + 6) * own[2]);
-        }
-    }
-    for (int64_t row = std::max(range.begin, range.end - e.reach); row < range.end; ++row)
-        for (int32_t i = e.row_starts[row + 1] - 1; e.cols[i] >= range.end; --i) {
-            const T* m = matrix + 9 * (int64_t)i;
-            const V4 other = load<V4>(p + 4 * (int64_t)e.cols[i]);
-            const V4 a = load<V4>(m) * other, b = load<V4>(m + 3) * other, c = load<V4>(m + 6) * other;
-            store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
-        }
+    const int64_t begin = 2 * range.begin, end = 2 * range.end;
+    const auto over = [&](Range pairs, const auto& add) {
+        for (int64_t slot = 2 * pairs.begin; slot < 2 * pairs.end; ++slot)
+            for (int64_t i = e.pair_starts[(slot >> 1) + 1] - 1; i > e.pair_starts[slot >> 1]; --i)
+                add(slot, e.pair_cols[2 * i + (slot & 1)], matrix + 24 * i + 4 * (slot & 1));
+    };
+    over({std::max<int64_t>(range.begin - e.reach, 0), range.begin}, [&](int64_t slot, int64_t col, const T* m) {
+        if (col < begin || col >= end) return;
+        const V4 own = load<V4>(p + 4 * slot);
+        store(q + 4 * col, load<V4>(q + 4 * col) + load<V4>(m) * own[0] + load<V4>(m + 8) * own[1] + load<V4>(m + 16) * own[2]);
+    });
+    over({std::max(range.begin, range.end - e.reach), range.end}, [&](int64_t slot, int64_t col, const T* m) {
+        if (col < end) return;
+        const V4 other = load<V4>(p + 4 * col);
+        const V4 a = load<V4>(m) * other, b = load<V4>(m + 8) * other, c = load<V4>(m + 16) * other;
+        store(q + 4 * slot, load<V4>(q + 4 * slot) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+    });
 }
 
-// z = B r of the rows of a part, in the place of q; r . z.
-template <class T> D4 precondition_rows(const Engine& e, Range range) {
+// z = B r of a pair, in the place of q; adds r . z.
+template <class T, class V8> inline void precondition(const Engine& e, int64_t pair, V8 left, D4& sum) {
+    const V8 result = by_block<T>((const T*)e.block + 24 * pair, left);
+    store((T*)e.q + 8 * pair, result);
+    add_product(sum, result, left);
+}
+
+// The vectors of conjugate gradients where they begin, with x = 0; r . z of a part.
+template <class T> D4 begin_pairs(const Engine& e, int64_t part, double scale) {
     typedef typename Four<T>::type V4;
-    const T *r = (const T*)e.r, *block = (const T*)e.block;
-    D4 sum = D4{};
-    for (int64_t row = range.begin; row < range.end; ++row) {
-        const V4 left = load<V4>(r + 4 * row), result = by_block<T>(block + 12 * row, left);
-        store((T*)e.q + 4 * row, result);
-        sum += __builtin_convertvector(result * left, D4);
+    typedef typename Pair<T>::type V8;
+    const Range range = pairs_of(e, part);
+    const int64_t first = 8 * range.begin, size = sizeof(T) * 8 * (range.end - range.begin);
+    for (void* vector : {e.x, e.z, e.p}) std::memset((T*)vector + first, 0, size);
+    for (int64_t slot = 2 * range.begin; slot < 2 * range.end; ++slot) {
+        const int64_t row = e.row_of_slot[slot];
+        store((T*)e.q + 4 * slot, row < 0 ? V4{} : __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
     }
+    sweep_on<T, true>(e, range);
+    std::memcpy((T*)e.r + first, (T*)e.q + first, size);
+    D4 sum = D4{};
+    for (int64_t pair = range.begin; pair < range.end; ++pair) precondition<T>(e, pair, load<V8>((T*)e.r + 8 * pair), sum);
     return sum;
 }
 
-// The vectors of conjugate gradients where they begin, with x = 0; r . z of the rows of a part.
-template <class T> D4 begin_rows(const Engine& e, int64_t part, double scale) {
-    typedef typename Four<T>::type V4;
-    const Range range = rows_of(e, part);
-    const int64_t first = 4 * range.begin, size = sizeof(T) * 4 * (range.end - range.begin);
-    for (int64_t row = range.begin; row < range.end; ++row)
-        store((T*)e.q + 4 * row, __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
-    std::memset((T*)e.x + first, 0, size);
-    std::memset((T*)e.z + first, 0, size);
-    sweep_on<T, true>(e, range);
-    std::memcpy((T*)e.r + first, (T*)e.q + first, size);
-    return precondition_rows<T>(e, range);
-}
-
-// A step along p; r . z of the rows of a part.
-template <class T> D4 step_rows(const Engine& e, int64_t part, T length) {
-    typedef typename Four<T>::type V4;
+// A step along p; r . z of a part.
+template <class T> D4 step_pairs(const Engine& e, int64_t part, T length) {
+    typedef typename Pair<T>::type V8;
     T *x = (T*)e.x, *r = (T*)e.r;
     const T *p = (const T*)e.p, *q = (const T*)e.q;
-    const Range range = rows_of(e, part);
-    for (int64_t row = range.begin; row < range.end; ++row) {
-        store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
-        store(r + 4 * row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
+    const Range range = pairs_of(e, part);
+    D4 sum = D4{};
+    for (int64_t pair = range.begin; pair < range.end; ++pair) {
+        const V8 left = load<V8>(r + 8 * pair) - length * load<V8>(q + 8 * pair);
+        store(x + 8 * pair, load<V8>(x + 8 * pair) + length * load<V8>(p + 8 * pair));
+        store(r + 8 * pair, left);
+        precondition<T>(e, pair, left, sum);
     }
-    return precondition_rows<T>(e, range);
+    return sum;
 }
 
 // The sum over the parts, and then over the axes.
@@ -921,7 +960,7 @@ template <class Compute> inline double sum_parts(const Engine& e, const Compute&
 // Adds to q what cloth near cloth makes of p beside the blocks.
 template <class T> void couple_cloth(const Engine& e) {
     if (near_layers(e)) couple_layers<T>(e);
-    if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.indefinite_share, (const T*)e.p, (T*)e.q);
+    if (e.layer_grips) couple_layer_grips<T>(*e.layer_grips, e.num_rows, e.slot, e.indefinite_share, (const T*)e.p, (T*)e.q);
 }
 
 // q = H' p' for p' = z + share p'; their product.
@@ -929,7 +968,7 @@ template <class T> double multiply(const Engine& e, T share) {
     for_parts(e.parts, [&](int64_t part) { sweep_back<T>(e, part, share); });
     couple_cloth<T>(e);
     return sum_parts(e, [&](int64_t part) {
-        const Range range = rows_of(e, part);
+        const Range range = pairs_of(e, part);
         if (e.parts > 1) couple_part<T>(e, range);
         return sweep_on<T, false>(e, range);
     });
@@ -946,7 +985,7 @@ template <class T> void read_direction(const Engine& e, double scale) {
     const T* x = (const T*)e.x;
     const double size = scale > 0.0 ? 1.0 / scale : 0.0;
     for (int64_t row = 0; row < e.num_rows; ++row)
-        for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = size * (double)x[4 * row + k];
+        for (int k = 0; k < 3; ++k) e.direction[4 * row + k] = size * (double)x[4 * (int64_t)e.slot[row] + k];
 }
 
 // Larger blocks of the diagonal in the preconditioner where parts meet, as long as this lives. Sweeps leave out what acts between
@@ -971,14 +1010,14 @@ template <class T> struct LargerBlocks {
         for (int64_t i = 0; i < e.num_border; ++i)
             for (int k = 0; k < 12; ++k) at((T*)e.block, i, k) = before[24 * i + k], at((T*)e.inverse, i, k) = before[24 * i + 12 + k];
     }
-    T& at(T* blocks, int64_t i, int k) const { return blocks[12 * (int64_t)e.border[i] + k]; }
+    T& at(T* blocks, int64_t i, int k) const { return own_block(e, blocks, e.border[i])[8 * (k / 4) + k % 4]; }
 };
 
 // Conjugate gradients for the direction; false where the matrix turned out not to be positive definite.
 template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
     const double scale = right_scale(e);
     const LargerBlocks<T> larger(e);
-    double rz = sum_parts(e, [&](int64_t part) { return begin_rows<T>(e, part, scale); });
+    double rz = sum_parts(e, [&](int64_t part) { return begin_pairs<T>(e, part, scale); });
     const double limit = tolerance * tolerance * rz;
     T share = T(0);
     bool definite = true;
@@ -990,7 +1029,7 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
         }
         const T length = (T)(rz / curvature);
         const double before = rz;
-        rz = sum_parts(e, [&](int64_t part) { return step_rows<T>(e, part, length); });
+        rz = sum_parts(e, [&](int64_t part) { return step_pairs<T>(e, part, length); });
         share = (T)(rz / before);
         ++e.cg_used;
     }
@@ -1001,21 +1040,28 @@ template <class T> bool solve(Engine& e, double tolerance, int64_t most) {
 // q = H p of a part, without what couples it to other parts.
 template <class T> void multiply_part(const Engine& e, Range range) {
     typedef typename Four<T>::type V4;
+    typedef typename Pair<T>::type V8;
     const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
     T* q = (T*)e.q;
-    std::memset(q + 4 * range.begin, 0, sizeof(T) * 4 * (range.end - range.begin));
-    for (int64_t row = range.begin; row < range.end; ++row) {
-        const T* m = matrix + 9 * (int64_t)e.row_starts[row];
-        const V4 own = load<V4>(p + 4 * row);
-        V4 a = load<V4>(m) * own, b = load<V4>(m + 3) * own, c = load<V4>(m + 6) * own;
-        for (int32_t i = e.row_starts[row] + 1; i < e.row_starts[row + 1] && e.cols[i] < range.end; ++i) {
-            m += 9;
-            const V4 first = load<V4>(m), second = load<V4>(m + 3), third = load<V4>(m + 6), other = load<V4>(p + 4 * (int64_t)e.cols[i]);
-            T* target = q + 4 * (int64_t)e.cols[i];
-            a += first * other, b += second * other, c += third * other;
-            store(target, load<V4>(target) + first * own[0] + second * own[1] + third * own[2]);
+    std::memset(q + 8 * range.begin, 0, sizeof(T) * 8 * (range.end - range.begin));
+    for (int64_t pair = range.begin; pair < range.end; ++pair) {
+        const T* m = matrix + 24 * (int64_t)e.pair_starts[pair];
+        const V8 own = load<V8>(p + 8 * pair), x = spread<0>(own), y = spread<1>(own), z = spread<2>(own);
+        V8 a = load<V8>(m) * own, b = load<V8>(m + 8) * own, c = load<V8>(m + 16) * own;
+        for (int64_t i = e.pair_starts[pair] + 1; i < e.pair_starts[pair + 1]; ++i) {
+            m += 24;
+            const V8 first = load<V8>(m), second = load<V8>(m + 8), third = load<V8>(m + 16), more = first * x + second * y + third * z;
+            const V4 halves[2] = {first_of(more), second_of(more)}, none = V4{};
+            const T* other[2];
+            for (int half = 0; half < 2; ++half) {
+                const int64_t col = e.pair_cols[2 * i + half];
+                other[half] = col < 2 * range.end ? p + 4 * col : (const T*)&none;
+                if (col < 2 * range.end) store(q + 4 * col, load<V4>(q + 4 * col) + halves[half]);
+            }
+            const V8 both = load_both(other[0], other[1]);
+            a = a + first * both, b = b + second * both, c = c + third * both;
         }
-        store(q + 4 * row, load<V4>(q + 4 * row) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+        store(q + 8 * pair, load<V8>(q + 8 * pair) + sum_axes(a, b, c));
     }
 }
 
@@ -1023,43 +1069,44 @@ template <class T> void multiply_part(const Engine& e, Range range) {
 // what so many lead to.
 template <class T> void solve_by_blocks(Engine& e, int64_t most) {
     typedef typename Four<T>::type V4;
+    typedef typename Pair<T>::type V8;
     T *x = (T*)e.x, *r = (T*)e.r, *z = (T*)e.z, *p = (T*)e.p, *q = (T*)e.q;
     const double scale = right_scale(e);
-    const auto sum_rows = [&](const auto& compute) {
+    const auto sum_pairs = [&](const auto& add) {
         return sum_parts(e, [&](int64_t part) {
             D4 sum = D4{};
-            const Range range = rows_of(e, part);
-            for (int64_t row = range.begin; row < range.end; ++row) sum += compute(row);
+            const Range range = pairs_of(e, part);
+            for (int64_t pair = range.begin; pair < range.end; ++pair) add(pair, sum);
             return sum;
         });
     };
-    const auto precondition = [&](int64_t row, V4 left) {
-        const V4 result = by_block<T>((const T*)e.inverse + 12 * row, left);
-        store(r + 4 * row, left), store(z + 4 * row, result);
-        return __builtin_convertvector(result * left, D4);
+    const auto precondition = [&](int64_t pair, V8 left, D4& sum) {
+        const V8 result = by_block<T>((const T*)e.inverse + 24 * pair, left);
+        store(r + 8 * pair, left), store(z + 8 * pair, result);
+        add_product(sum, result, left);
     };
-    double rz = sum_rows([&](int64_t row) {
-        const D4 sum = precondition(row, __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
-        store(x + 4 * row, V4{}), store(p + 4 * row, load<V4>(z + 4 * row));
-        return sum;
+    double rz = sum_pairs([&](int64_t pair, D4& sum) {
+        for (int64_t slot = 2 * pair; slot < 2 * pair + 2; ++slot) {
+            const int64_t row = e.row_of_slot[slot];
+            store(r + 4 * slot, row < 0 ? V4{} : __builtin_convertvector(-scale * load<D4>(e.gradient + 4 * row), V4));
+        }
+        precondition(pair, load<V8>(r + 8 * pair), sum);
+        store(x + 8 * pair, V8{}), store(p + 8 * pair, load<V8>(z + 8 * pair));
     });
     for (int64_t iteration = 0; iteration < most && rz > 0.0; ++iteration) {
-        for_parts(e.parts, [&](int64_t part) { multiply_part<T>(e, rows_of(e, part)); });
+        for_parts(e.parts, [&](int64_t part) { multiply_part<T>(e, pairs_of(e, part)); });
         couple_cloth<T>(e);
-        if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, rows_of(e, part)); });
-        const double curvature = sum_rows([&](int64_t row) { return __builtin_convertvector(load<V4>(p + 4 * row) * load<V4>(q + 4 * row), D4); });
+        if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, pairs_of(e, part)); });
+        const double curvature = sum_pairs([&](int64_t pair, D4& sum) { add_product(sum, load<V8>(p + 8 * pair), load<V8>(q + 8 * pair)); });
         if (!(curvature > 0.0)) break;
         const T length = (T)(rz / curvature);
         const double before = rz;
-        rz = sum_rows([&](int64_t row) {
-            store(x + 4 * row, load<V4>(x + 4 * row) + length * load<V4>(p + 4 * row));
-            return precondition(row, load<V4>(r + 4 * row) - length * load<V4>(q + 4 * row));
+        rz = sum_pairs([&](int64_t pair, D4& sum) {
+            store(x + 8 * pair, load<V8>(x + 8 * pair) + length * load<V8>(p + 8 * pair));
+            precondition(pair, load<V8>(r + 8 * pair) - length * load<V8>(q + 8 * pair), sum);
         });
         const T share = (T)(rz / before);
-        sum_rows([&](int64_t row) {
-            store(p + 4 * row, load<V4>(z + 4 * row) + share * load<V4>(p + 4 * row));
-            return D4{};
-        });
+        sum_pairs([&](int64_t pair, D4&) { store(p + 8 * pair, load<V8>(z + 8 * pair) + share * load<V8>(p + 8 * pair)); });
         ++e.cg_used;
     }
     read_direction<T>(e, scale);
@@ -1129,9 +1176,9 @@ template <class T> void make_exact(Engine& e, T* blocks) {
                     for (int b = 1; b <= count; ++b) {
                         const int d = use[b] & 3;
                         const T* block = blocks + 90 * (int64_t)(use[0] >> 2) + 9 * PAIRS[c][d];
-                        T* target = matrix + 9 * ((int64_t)e.row_starts[row] + (use[b] >> 2));
+                        T* target = blocks_of(e, matrix, row) + 24 * (int64_t)(use[b] >> 2);
                         for (int k = 0; k < 3; ++k)
-                            for (int j = 0; j < 3; ++j) target[3 * k + j] += c <= d ? block[3 * k + j] : block[3 * j + k];
+                            for (int j = 0; j < 3; ++j) target[8 * k + j] += c <= d ? block[3 * k + j] : block[3 * j + k];
                     }
                 }
     });
@@ -1150,10 +1197,10 @@ template <class T> void prepare_points(const Engine& e, const Points& set) {
             for (int c = 0; c < 3; ++c) {
                 const int64_t row = set.corners[3 * i + c];
                 if (row >= e.num_rows) continue;
-                const T* m = (const T*)e.inverse + 12 * row;
+                const T* m = own_block(e, (const T*)e.inverse, row);
                 for (int k = 0; k < 3; ++k) {
                     step[k] += weights[c] * e.direction[4 * row + k];
-                    stop[3 * c + k] = weights[c] * ((double)m[k] * normal[0] + (double)m[4 + k] * normal[1] + (double)m[8 + k] * normal[2]);
+                    stop[3 * c + k] = weights[c] * ((double)m[k] * normal[0] + (double)m[8 + k] * normal[1] + (double)m[16 + k] * normal[2]);
                 }
                 stop[9] += weights[c] * dot3(stop + 3 * c, normal);
             }
@@ -1169,16 +1216,15 @@ template <class T> void prepare_path(const Engine& e) {
     const T* inverse = (const T*)e.inverse;
     for (int64_t w = 0; w < e.num_walls; ++w)
         for (int64_t row = 0; row < e.num_rows; ++row) {
-            const int64_t v = e.vertex[row];
-            const double *pos = e.pos + 4 * row, *step = e.direction + 4 * row, *normal = e.walls[w].normal + 3 * v;
+            const double *pos = e.pos + 4 * row, *step = e.direction + 4 * row, *normal = e.walls[w].normal + 3 * row;
             const double end[3] = {pos[0] + step[0], pos[1] + step[1], pos[2] + step[2]};
-            const double here = depth_of(e.walls[w], v, pos), there = depth_of(e.walls[w], v, end);
+            const double here = depth_of(e.walls[w], row, pos), there = depth_of(e.walls[w], row, end);
             double* stop = e.path + 8 * (w * e.num_rows + row);
             stop[5] = here > 0.0 || there > 0.0;
             if (stop[5] == 0.0) continue;
             for (int k = 0; k < 3; ++k) {
-                const T* m = inverse + 12 * row + k;
-                stop[k] = (double)m[0] * normal[0] + (double)m[4] * normal[1] + (double)m[8] * normal[2];
+                const T* m = own_block(e, inverse, row) + k;
+                stop[k] = (double)m[0] * normal[0] + (double)m[8] * normal[1] + (double)m[16] * normal[2];
             }
             stop[3] = dot3(stop, normal);
             stop[4] = here > 0.0 ? here : 0.0;
@@ -1223,10 +1269,9 @@ void walk(const Engine& e, double length) {
         for (int64_t row = 0; row < e.num_rows; ++row) {
             const double* stop = e.path + 8 * (w * e.num_rows + row);
             if (stop[5] == 0.0) continue;
-            const int64_t v = e.vertex[row];
             double *acc = e.trial_acc + 4 * row, pos[3];
-            for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + e.dt_sq * acc[k];
-            const double push = contact_push(wall.weight, stop[4], depth_of(wall, v, pos), stop[3]) / e.dt_sq;
+            for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * row + k] + e.dt_sq * acc[k];
+            const double push = contact_push(wall.weight, stop[4], depth_of(wall, row, pos), stop[3]) / e.dt_sq;
             if (!(push > 0.0)) continue;
             for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
         }
@@ -1254,40 +1299,42 @@ double free_share(const Engine& e) {
 void ease_trial(const Engine& e) {
     e.layers->ease(e.layers->layers, e.layers->here, e.layers->there, e.kept);
     for (int64_t row = 0; row < e.num_rows; ++row) {
-        const double* base = e.base + 3 * e.vertex[row];
+        const double* base = e.base + 3 * row;
         for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = (e.layers->there[3 * e.vertex_of_scene[row] + k] - base[k]) / e.dt_sq;
     }
     place(e, e.trial_acc, e.trial_pos);
 }
 
-void take_trial(Engine& e, double phi, double noise) {
+void take_trial(Engine& e, bool modelled, double phi, double noise) {
     std::memcpy(e.pos, e.trial_pos, sizeof(double) * 4 * e.num_rows);
     std::memcpy(e.acc, e.trial_acc, sizeof(double) * 4 * e.num_rows);
-    e.phi = phi, e.noise = noise;
+    e.modelled = modelled, e.phi = phi, e.noise = noise;
 }
 
 bool backtrack(Engine& e) {
     double slope = 0.0, length = 1.0;
     for (int64_t row = 0; row < e.num_rows; ++row) slope += dot3(e.gradient + 4 * row, e.direction + 4 * row);
     if (!(slope < 0.0)) return false;
+    e.modelled = false;
     for (int attempt = 0; attempt < 40; ++attempt) {
         double phi, noise;
+        const bool model = attempt == 0;  // most often the first one is taken
         walk(e, length);
         const double share = free_share(e);
         if (share < e.eased) {
             ease_trial(e);
-            energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
+            energy(e, e.trial_pos, e.trial_acc, false, &phi, &noise);
             if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
-                take_trial(e, phi, noise);
+                take_trial(e, false, phi, noise);
                 return true;
             }
             walk(e, length);
         }
         if (share < 1.0) shorten_trial(e, share);
         length *= share;
-        energy(e, e.trial_pos, e.trial_acc, &phi, &noise);
+        energy(e, e.trial_pos, e.trial_acc, model, &phi, &noise);
         if (phi <= e.phi + 1e-4 * length * slope + e.noise) {
-            take_trial(e, phi, noise);
+            take_trial(e, model, phi, noise);
             return true;
         }
         // The minimum of the parabola through what is known, between a tenth and a half of the last length.
@@ -1326,7 +1373,7 @@ inline void solve_block(const double* upper, const double* b, double* x) {
 
 void hold_fixed(const Engine& e) {
     for (int64_t i = e.num_rows; i < e.num_vertices; ++i)
-        for (int k = 0; k < 3; ++k) e.pos[4 * i + k] = e.trial_pos[4 * i + k] = e.fixed[3 * e.vertex[i] + k];
+        for (int k = 0; k < 3; ++k) e.pos[4 * i + k] = e.trial_pos[4 * i + k] = e.fixed[3 * i + k];
 }
 
 // Free flight, falling or not, then out of the first wall, as far as it carries the weight.
@@ -1336,13 +1383,13 @@ void guess(const Engine& e, const double* mass, const double* gravity, bool fall
     for (int64_t row = 0; row < e.num_rows; ++row) {
         const int64_t v = e.vertex[row];
         double pos[3];
-        for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * v + k] + (falls ? e.dt_sq * gravity[k] : 0.0);
+        for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * row + k] + (falls ? e.dt_sq * gravity[k] : 0.0);
         if (walled) {
-            const double out = depth_of(e.walls[0], v, pos) - contact_depth(e.walls[0].weight, mass[v] * size);
+            const double out = depth_of(e.walls[0], row, pos) - contact_depth(e.walls[0].weight, mass[v] * size);
             if (out > 0.0)
-                for (int k = 0; k < 3; ++k) pos[k] += out * e.walls[0].normal[3 * v + k];
+                for (int k = 0; k < 3; ++k) pos[k] += out * e.walls[0].normal[3 * row + k];
         }
-        for (int k = 0; k < 3; ++k) acc[4 * row + k] = (pos[k] - e.base[3 * v + k]) / e.dt_sq;
+        for (int k = 0; k < 3; ++k) acc[4 * row + k] = (pos[k] - e.base[3 * row + k]) / e.dt_sq;
     }
 }
 
@@ -1358,7 +1405,8 @@ void newton_start(Engine* e, const double* acc) {
     for (int64_t row = 0; row < e->num_rows; ++row)
         for (int k = 0; k < 3; ++k) e->acc[4 * row + k] = acc[3 * e->vertex[row] + k];
     place(*e, e->acc, e->pos);
-    energy(*e, e->pos, e->acc, &e->phi, &e->noise);
+    energy(*e, e->pos, e->acc, true, &e->phi, &e->noise);
+    e->modelled = true;
 }
 
 // The better of two guesses becomes the state, see hood.solver.system.iterate.first_iterate; masses (V) kg, gravity (3) m/s^2.
@@ -1370,11 +1418,12 @@ void newton_guess(Engine* e, const double* mass, const double* gravity) {
     double phi, noise;
     guess(*e, mass, gravity, true, e->trial_acc);
     place(*e, e->trial_acc, e->trial_pos);
-    energy(*e, e->trial_pos, e->trial_acc, &phi, &noise);
+    energy(*e, e->trial_pos, e->trial_acc, false, &phi, &noise);
     guess(*e, mass, gravity, false, e->acc);
     place(*e, e->acc, e->pos);
-    energy(*e, e->pos, e->acc, &e->phi, &e->noise);
-    if (!(e->phi < phi)) take_trial(*e, phi, noise);
+    energy(*e, e->pos, e->acc, true, &e->phi, &e->noise);  // cloth seldom falls freely
+    e->modelled = true;
+    if (!(e->phi < phi)) take_trial(*e, false, phi, noise);
     e->layers = layers, e->layer_grips = layer_grips;
 }
 
@@ -1436,9 +1485,10 @@ void newton_alone(Engine* e, const float* pos, float* force, float* step) {
         const int64_t v = e->vertex[i];
         for (int k = 0; k < 3; ++k) {
             e->pos[4 * i + k] = pos[3 * v + k];
-            if (i < e->num_rows) e->acc[4 * i + k] = (e->pos[4 * i + k] - e->base[3 * v + k]) / e->dt_sq;
+            if (i < e->num_rows) e->acc[4 * i + k] = (e->pos[4 * i + k] - e->base[3 * i + k]) / e->dt_sq;
         }
     }
+    e->modelled = false;
     differentiate<Real>(*e);
     for (int64_t row = 0; row < e->num_rows; ++row) {
         const Real* blocks = (const Real*)e->own + 6 * row;
@@ -1481,15 +1531,14 @@ void newton_together(Engine* e, const float* force, const float* damping, int64_
     gather_matrix<Real>(*e);
     for (int64_t row = 0; row < e->num_rows; ++row) {
         const int64_t v = e->vertex[row];
-        Real* block = (Real*)e->matrix + 9 * (int64_t)e->row_starts[row];
+        Real* block = blocks_of(*e, (Real*)e->matrix, row);
         for (int k = 0; k < 3; ++k) {
             e->gradient[4 * row + k] = -(double)force[3 * v + k];
-            block[4 * k] += (Real)damping[v];
+            block[9 * k] += (Real)damping[v];
         }
-        const V4 rows[3] = {V4{block[0], block[1], block[2], Real(0)}, V4{block[3], block[4], block[5], Real(0)},
-                            V4{block[6], block[7], block[8], Real(0)}};
-        invert<Real>(rows, (Real*)e->block + 12 * row, (Real*)e->inverse + 12 * row);
+        for (int k = 0; k < 3; ++k) store(own_block(*e, (Real*)e->block, row) + 8 * k, load<V4>(block + 8 * k));
     }
+    invert_blocks<Real>(*e, {0, e->num_rows});
     solve_by_blocks<Real>(*e, iterations);
     for (int64_t row = 0; row < e->num_rows; ++row)
         for (int k = 0; k < 3; ++k) step[3 * e->vertex[row] + k] = (float)e->direction[4 * row + k];

@@ -53,7 +53,7 @@ def dense(scene: CompiledScene, name: str) -> np.ndarray:
     tables, size = scene.tables, scene.tables.num_rows
     blocks = np.zeros((len(tables.cols), 3, 3))
     if name == "matrix":
-        blocks += scene.array("matrix")[: 9 * len(tables.cols)].reshape(-1, 3, 3)
+        blocks += tables.blocks(scene.array("matrix"))
     else:
         blocks += scene.array("indefinite_part")[:, None, None] * np.eye(3)
         upper = scene.array("own_indefinite_part").reshape(-1, 6)
@@ -356,3 +356,70 @@ def test_the_order_of_the_rows_leads_to_the_triangles_of_cuthill_and_mckee():
     assert sorted(place.tolist()) == list(range(size))
     before, after = triu(graph[order][:, order], k=1).nonzero()
     assert (place[before] < place[after]).all()
+
+
+def strip(count):
+    """A strip of triangles one by one, of which every vertex is a neighbour of the next two."""
+    along = np.arange(count)
+    pos = np.stack([0.01 * along, 0.02 * (along % 2), np.zeros(count)], axis=1)
+    faces = np.stack([along[:-2], along[1:-1], along[2:]], axis=1)
+    faces[1::2] = faces[1::2, ::-1]
+    return build_cloth(pos, faces, Material(), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("make", [lambda: hanging().cloth, lambda: strip(40), lambda: strip(3)])
+def test_pairs_have_every_row_once_and_no_neighbours(make):
+    tables = build_tables(make(), None, 0)
+    pairs = tables.pairs
+    assert np.array_equal(pairs.row[pairs.slot], np.arange(tables.num_rows))
+    assert len(pairs.row) == 2 * (len(pairs.starts) - 1)
+    assert np.count_nonzero(pairs.row >= 0) == tables.num_rows
+    rows = np.repeat(np.arange(tables.num_rows), np.diff(tables.row_starts))
+    same_pair = pairs.slot[rows] // 2 == pairs.slot[tables.cols] // 2
+    assert np.array_equal(same_pair, rows == tables.cols)
+    for pair, (start, end) in enumerate(zip(pairs.starts[:-1], pairs.starts[1:], strict=True)):
+        for half in range(2):
+            row, cols = pairs.row[2 * pair + half], pairs.cols[start:end, half]
+            own = np.full(end - start, 2 * pair + half)
+            if row >= 0:
+                known = pairs.slot[tables.cols[tables.row_starts[row] : tables.row_starts[row + 1]]]
+                own[: len(known)] = known
+            assert np.array_equal(cols, own)
+
+
+def test_a_strip_in_which_every_row_waits_for_the_next_is_solved_as_in_torch():
+    problem = make_problem(strip(40))
+    _, expected = minimize(default_potential(), problem, settings=TORCH)
+    _, report = minimize(default_potential(), problem, settings=COMPILED)
+    torch.testing.assert_close(report.phi, expected.phi, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [hanging, falling, touching_sheet])
+def test_models_made_by_a_line_search_are_those_of_the_state(make):
+    problem = make()
+    (scene,) = (system := CompiledSystem(default_potential(), problem, plan_for(problem), 100))._engines
+    system.begin(None)
+    kept = []
+    for _ in range(6):
+        residual = system.model()
+        found = scene.array("gradient").copy(), scene.array("face_model").copy(), scene.array("hinge_model").copy()
+        scene.values.modelled = 0
+        assert system.model() == residual
+        for name, before in zip(("gradient", "face_model", "hinge_model"), found, strict=True):
+            assert np.array_equal(scene.array(name), before), name
+        if not system.move(residual, [True])[0]:
+            break
+        kept.append(scene.values.modelled)
+    assert any(kept)
+
+
+def test_a_step_that_float64_takes_over_has_models_of_its_own():
+    problem = hanging()
+    (scene,) = (system := CompiledSystem(default_potential(), problem, plan_for(problem), 100))._engines
+    system.begin(None)
+    residual = system.model()
+    assert system.move(residual, [True])[0]
+    single = system.model()[0]
+    scene.widen(True)
+    assert system.model()[0] == pytest.approx(single, rel=1e-12)
+    assert np.frombuffer(scene.array("face_model").tobytes(), np.float64).any()

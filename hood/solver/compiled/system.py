@@ -58,7 +58,8 @@ class CompiledScene:
             num_blocks=len(tables.cols),
             num_springs=len(tables.springs.order),
             most_blocks=tables.most_blocks,
-            reach=tables.reach,
+            num_pairs=len(tables.pairs.starts) - 1,
+            reach=tables.pairs.reach,
         )
         self._address = ctypes.byref(self.values)
         self._point(
@@ -67,6 +68,10 @@ class CompiledScene:
             hinge_corners=tables.hinges.corners,
             row_starts=tables.row_starts,
             cols=tables.cols,
+            slot=tables.pairs.slot,
+            row_of_slot=tables.pairs.row,
+            pair_starts=tables.pairs.starts,
+            pair_cols=tables.pairs.cols,
             face_starts=tables.faces.starts,
             face_uses=tables.faces.uses,
             hinge_starts=tables.hinges.starts,
@@ -94,21 +99,15 @@ class CompiledScene:
         if key not in self._memory:
             self._memory[key] = self._working_memory()
         self._point(**self._memory[key])
+        self.values.modelled = 0  # those of the elements are elsewhere
         self.values.num_border = len(self._memory[key]["border"])
 
     def _working_memory(self) -> dict[str, np.ndarray]:
         values, kind = self.values, np.float64 if self.wide else np.float32
-        rows, blocks = values.num_rows, values.num_blocks
-        sizes = {
-            "matrix": 9 * blocks + 1,
-            "indefinite_part": blocks,
-            "own": 6 * rows,
-            "own_indefinite_part": 6 * rows,
-            "block": 12 * rows,
-            "inverse": 12 * rows,
-        }
-        memory = {name: np.zeros(count, kind) for name, count in sizes.items()}
-        memory |= {name: np.zeros(4 * rows, kind) for name in "xrzpq"}
+        rows, pairs = values.num_rows, values.num_pairs
+        sizes = {"indefinite_part": values.num_blocks, "own": 6 * rows, "own_indefinite_part": 6 * rows}
+        sizes |= {"matrix": 24 * len(self.tables.pairs.cols), **dict.fromkeys(("block", "inverse"), 24 * pairs)}
+        memory = {name: _aligned(count, kind) for name, count in (sizes | dict.fromkeys("xrzpq", 8 * pairs)).items()}
         memory |= self.tables.border(values.parts, kind)
         memory["row_sum"] = _aligned(16 * values.most_blocks * values.parts, kind)
         memory["face_model"] = np.zeros(values.num_faces * self._lib.newton_face_record(), np.uint8)
@@ -120,10 +119,10 @@ class CompiledScene:
         values = self.values
         self.step = step
         self._take_fabric(step)
-        self._point(base=step.base, fixed=step.fixed, inertia=step.inertia, weight=step.weight)
-        springs = self.tables.springs.order
-        self._point(spring_stiffness=step.spring_stiffness[springs], spring_target=step.spring_target[springs])
-        walls, grips = wall_structures(step.walls), grip_structures(step.grips)
+        self._point(**step.of(self.tables.vertex))
+        self._point(**{name: getattr(step, name)[self.tables.springs.order] for name in ("spring_stiffness", "spring_target")})
+        of_walls, of_grips = step.contact_of(self.tables.vertex)
+        walls, grips = wall_structures(of_walls), grip_structures(of_grips)
         own = [_ScenePoints(points, self.tables, step.cloth.num_vertices) for points in step.points] if step.points else []
         points = (_Points * len(own))(*(one.values for one in own))
         self._kept |= {"walls": walls, "grips": grips, "points": (points, own), "step": step}
@@ -160,10 +159,11 @@ class CompiledScene:
             self.values.layers = None
             return
         vertex = self.tables.vertex - scene.first
-        row = np.empty_like(vertex)
-        row[vertex] = np.arange(len(vertex))
+        slots = 2 * self.values.num_pairs
+        number = np.full(len(vertex), slots)
+        number[vertex[: self.values.num_rows]] = self.tables.pairs.slot
         self._point(vertex_of_scene=vertex)
-        self.values.layers = scene.layers.number(row, self.values.num_rows)
+        self.values.layers = scene.layers.number(number, slots)
         self.values.kept, self.values.eased = LEFT, EASED
 
     def _take_layer_grips(self, grips: LayerGrips | None, scene: int, num_vertices: int) -> None:

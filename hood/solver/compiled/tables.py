@@ -40,6 +40,22 @@ class Elements:
 
 
 @dataclass(frozen=True)
+class Pairs:
+    """Rows as sweeps take them, two at a time: consecutive ones that are no neighbours, or one alone. Each has a slot for its
+    numbers: twice the pair, and one more in its second half. Blocks of a pair lie beside each other as (3, 2, 4) numbers."""
+
+    slot: np.ndarray  # (R,) int32
+    row: np.ndarray  # (2 P,) int32 by slot, -1 where a half is empty
+    starts: np.ndarray  # (P + 1,) int32
+    cols: np.ndarray  # (L, 2) int32 slots of the columns, the diagonal first; where a row is shorter, its own
+
+    @property
+    def reach(self) -> int:
+        """How many pairs a column is behind its row at most."""
+        return int((self.cols // 2 - np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))[:, None]).max(initial=0))
+
+
+@dataclass(frozen=True)
 class Tables:
     """Topology of one scene for the compiled solver; valid as long as its plan."""
 
@@ -47,6 +63,7 @@ class Tables:
     num_rows: int
     row_starts: np.ndarray  # (R + 1,) int32
     cols: np.ndarray  # (K,) int32, that of the diagonal first in every row, then later ones
+    pairs: Pairs
     faces: Elements
     hinges: Elements
     springs: Elements  # attachments of the step
@@ -56,18 +73,19 @@ class Tables:
         """Blocks of the longest row."""
         return int(np.diff(self.row_starts).max(initial=0))
 
-    @property
-    def reach(self) -> int:
-        """How far a column is behind its row at most."""
-        return int((self.cols - np.repeat(np.arange(self.num_rows), np.diff(self.row_starts))).max(initial=0))
+    def blocks(self, matrix: np.ndarray) -> np.ndarray:
+        """Blocks (K, 3, 3) of the compiled solver's ``matrix``, in the order of :attr:`cols`."""
+        place = np.repeat(self.pairs.starts[self.pairs.slot // 2] - self.row_starts[:-1], np.diff(self.row_starts))
+        half = np.repeat(self.pairs.slot % 2, np.diff(self.row_starts))
+        return matrix.reshape(-1, 3, 2, 4)[np.arange(len(self.cols)) + place, :, half, :3]
 
     def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
         """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
         neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``. Parts are those of ``range_of``
         in ``hood/native/threads.h``."""
-        size = self.num_rows
+        size, pairs = self.num_rows, len(self.pairs.starts) - 1
         rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
-        part = np.searchsorted(size * np.arange(1, parts) // parts, np.arange(size), side="right")
+        part = np.searchsorted(pairs * np.arange(1, parts) // parts, self.pairs.slot // 2, side="right")
         both, other = np.concatenate([rows, cols]), np.tile(part[rows] != part[cols], 2)
         outside = np.bincount(both, other, size) / np.maximum(np.bincount(both, minlength=size) - 2, 1)  # but the diagonal
         border = np.flatnonzero(outside)
@@ -99,6 +117,7 @@ def build_tables(cloth: Cloth, attachments: Attachments | None, scene: int) -> T
         num_rows=size,
         row_starts=starts.astype(np.int32),
         cols=cols.astype(np.int32),
+        pairs=_pairs(starts, cols),
         faces=_elements(chosen[0], corners[0], keys, starts),
         hinges=_elements(chosen[1], corners[1], keys, starts),
         springs=_elements(chosen[2], corners[2], keys, starts, lanes=1),
@@ -155,6 +174,28 @@ def _by_levels(graph: sparse.csr_matrix, order: np.ndarray) -> np.ndarray:
         level[row] = 1 + max((level[col] for col in cols[starts[row] : starts[row + 1]]), default=-1)
     levels, count = np.array(level, np.int64), np.diff(later.indptr)
     return np.lexsort((np.where(levels % 2, count, -count), -levels))
+
+
+def _pairs(starts: np.ndarray, cols: np.ndarray) -> Pairs:
+    """Pairs of the rows with the columns ``cols`` (K,), those of a row ascending from ``starts`` (R + 1,) on."""
+    size = len(starts) - 1
+    beside = np.append(cols, size)[np.minimum(starts[:-1] + 1, len(cols))]
+    alone = (beside == np.arange(1, size + 1)) & (np.diff(starts) > 1)  # the next row is a neighbour
+    slot, place = np.empty(size, np.int32), 0
+    for row, single in enumerate(alone.tolist()):
+        slot[row] = place
+        place += 2 if single and place % 2 == 0 else 1
+    num = (place + 1) // 2
+    row_of = np.full(2 * num, -1, np.int32)
+    row_of[slot] = np.arange(size)
+    length = np.zeros(2 * num, np.int64)
+    length[slot] = np.diff(starts)
+    pair_starts = np.append(0, np.cumsum(length.reshape(-1, 2).max(axis=1, initial=0)))
+    pair = np.repeat(np.arange(num), np.diff(pair_starts))
+    both = np.stack([2 * pair, 2 * pair + 1], axis=1).astype(np.int32)
+    blocks = np.arange(len(cols)) + np.repeat(pair_starts[slot // 2] - starts[:-1], np.diff(starts))
+    both[blocks, np.repeat(slot % 2, np.diff(starts))] = slot[cols]
+    return Pairs(slot, row_of, pair_starts.astype(np.int32), both)
 
 
 def _block_keys(tables: list[np.ndarray], size: int) -> np.ndarray:
