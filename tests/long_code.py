@@ -95,7 +95,6 @@ MODULES = {
     "hood/assets/pickles/records.py": "one reader of pickles: its list of stand-ins, and the arrays they become",
     "hood/cli/sew.py": "two commands that make a garment and show how it sits",
     "hood/media/exports/sequences.py": "every format of a mesh and its frames: OBJ, PLY, PC2, MDD",
-    "hood/steppers/newton.py": "the protocol of steppers, and the solver as one of them",
     "hood/studies/envelope/page.py": "one map, as a page and as a section of a document",
     "hood/studies/plan/page.py": "one plan, as a table and as a page",
     "hood/studies/plan/plan.py": "one plan from its words to its file",

@@ -275,6 +275,18 @@ def relative_gradient(problem: StepProblem, gradient: Tensor) -> Tensor:
     return torch.where(movable, (force_sq / torch.where(movable, weight_sq, 1.0)).sqrt(), 0.0)
 
 
+def weight_norms(problem: StepProblem) -> list[float]:
+    """‖M g‖₂ [N] (B) over free vertices, what :func:`relative_gradient` divides by; kept as long as the cloth is what it is."""
+    cloth, gravity = problem.cloth, problem.gravity.tolist()
+    made, version = made_of(cloth), None if cloth.mass.is_inference() else cloth.mass._version
+    known = made.get("weight")
+    if known is None or version is None or known[0] != (version, gravity):
+        weight = cloth.free * cloth.mass * float(_gravity_norm(problem))
+        known = made["weight"] = (version, gravity), problem.sum_vertices(weight**2).sqrt().tolist()
+    norms: list[float] = known[1]
+    return norms
+
+
 def _gravity_norm(problem: StepProblem) -> Tensor:
     norm = problem.gravity.norm()
     return torch.where(norm > 0, norm, STANDARD_GRAVITY)

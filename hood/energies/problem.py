@@ -47,7 +47,7 @@ class StepProblem:
     second_contact: SecondContact | None = None  # with the other side of folds of the body
 
     def __post_init__(self) -> None:
-        if len(self.step.dt) != self.cloth.num_scenes:
+        if self.step.dt.shape[0] != self.cloth.num_scenes:
             raise ValueError(
                 f"step problem: dt has {len(self.step.dt)} entries for {self.cloth.num_scenes} scenes; give one per scene"
             )
@@ -61,8 +61,10 @@ class StepProblem:
         """Numbers that change where state, what is prescribed, masses or gravity are changed in place; None where tensors do
         not count their changes."""
         given = self.cloth.mass, self.gravity, *vars(self.state).values(), *vars(self.step).values()
-        tensors = [value for value in given if isinstance(value, Tensor)]
-        return None if any(tensor.is_inference() for tensor in tensors) else tuple(tensor._version for tensor in tensors)
+        try:
+            return tuple(value._version for value in given if isinstance(value, Tensor))
+        except RuntimeError:  # made in inference mode
+            return None
 
     def with_contact(self) -> StepProblem:
         """The problem with its contact, searched for at x_t; itself where that has been done or there is no body."""
@@ -216,10 +218,7 @@ class StepProblem:
     @property
     def vertex_dt(self) -> Tensor:
         """Time step [s] of every vertex's scene, (V, 1); a view of one number where there is one scene, on a CPU."""
-        dt = self.step.dt
-        if self.num_scenes == 1 and dt.device.type == "cpu" and not dt.requires_grad:
-            return dt.expand(self.cloth.num_vertices, 1)
-        return dt[self.cloth.vertex_scene].unsqueeze(1)
+        return _dt_of(self.step, self.cloth.vertex_scene)
 
     def acceleration(self, next_pos: Tensor) -> Tensor:
         """Accelerations [m/s²] (V, 3) that lead to ``next_pos`` (V, 3): (x - x_t - dt v_t) / dt².
@@ -237,8 +236,15 @@ class StepProblem:
 
 def inertial_guess(state: State, step: StepInput, vertex_scene: Tensor | None = None) -> Tensor:
     """Positions (V, 3) without any force, x_t + dt v_t; several scenes need ``vertex_scene`` (V,)."""
-    dt = step.dt if vertex_scene is None else step.dt[vertex_scene]
-    return state.pos + dt.unsqueeze(1) * state.vel
+    dt = step.dt.unsqueeze(1) if vertex_scene is None else _dt_of(step, vertex_scene)
+    return state.pos + dt * state.vel
+
+
+def _dt_of(step: StepInput, vertex_scene: Tensor) -> Tensor:
+    dt = step.dt
+    if dt.shape[0] == 1 and dt.device.type == "cpu" and not dt.requires_grad:
+        return dt.expand(vertex_scene.shape[0], 1)
+    return dt[vertex_scene].unsqueeze(1)
 
 
 def free_flight(problem: StepProblem) -> Tensor:

@@ -307,7 +307,8 @@ def recentre(state: State, vertex_scene: Tensor, centres: Tensor | None = None) 
         centres: :func:`centres_of` the positions, on the CPU, where they are known; otherwise this waits for the device, once.
     """
     if centres is None and len(state.origin) == 1 and state.pos.device.type == "cpu":
-        if bool((state.pos.mean(dim=0).abs() < 0.99 * _GRID).all()):  # below the half that is rounded up
+        # Below the half that is rounded up.
+        if all(abs(value) < 0.99 * _GRID for value in state.pos.mean(dim=0).tolist()):
             return state
     known = centres_of(state.pos, vertex_scene, len(state.origin)).cpu() if centres is None else centres
     # A broken cloth has no centre; its frame stays, so that the body can still be seen.

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -73,18 +73,52 @@ class NewtonSettings:
             raise ValueError(f"solver: linear is {self.linear!r}; choose cg or direct")
 
 
+class Iteration(NamedTuple):
+    """Where a minimisation stood before an iteration, and where it ended: numbers of the scenes (B)."""
+
+    seconds: float
+    phi: list[float]  # J
+    relative_gradient: list[float]
+
+    def on(self, device: torch.device) -> Progress:
+        """The same in tensors (B,), float64."""
+        return Progress(self.seconds, *(torch.tensor(row, dtype=torch.float64, device=device) for row in self[1:]))
+
+
 @dataclass(frozen=True)
 class Report:
-    """What :func:`minimize` reached, scene by scene; float64 where it computed in float64."""
+    """What :func:`minimize` reached, scene by scene."""
 
     iterations: int
     cg_iterations: int
-    phi: Tensor  # (B,) J
-    relative_gradient: Tensor  # (B,)
-    converged: Tensor  # (B,) bool
     reason: tuple[str, ...]  # (B) of :mod:`hood.solver.step_figures`
     acc: Tensor  # (V, 3) m/s² that leads to the positions, without their cancellation in float32
-    history: list[Progress] = field(default_factory=list)
+    course: list[Iteration]  # before every iteration, and at the end
+
+    @property
+    def residual(self) -> float:
+        """The largest relative gradient of the scenes, NaN where one is."""
+        return max(self.course[-1].relative_gradient, key=lambda value: (math.isnan(value), value))
+
+    @property
+    def phi(self) -> Tensor:
+        """(B,) J."""
+        return self.course[-1].on(self.acc.device).phi
+
+    @property
+    def relative_gradient(self) -> Tensor:
+        """(B,)."""
+        return self.course[-1].on(self.acc.device).relative_gradient
+
+    @property
+    def converged(self) -> Tensor:
+        """(B,) bool."""
+        return torch.tensor([not reason for reason in self.reason], device=self.acc.device)
+
+    @cached_property
+    def history(self) -> list[Progress]:
+        """``course`` in tensors."""
+        return [place.on(self.acc.device) for place in self.course]
 
 
 @torch.no_grad()
@@ -124,10 +158,17 @@ def minimize(
         system.begin(start)
         pos, report = run(system, work.state.pos, settings, began, proceed)
         if free_way(layers, work.state.pos, pos):
-            return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
+            return _in_type_of(problem, work, pos, report)
     system = system_of(potential, work, plan, settings)
     system.begin(start)
     pos, report = run(system, work.state.pos, settings, began, proceed)
+    return _in_type_of(problem, work, pos, report)
+
+
+def _in_type_of(problem: StepProblem, work: StepProblem, pos: Tensor, report: Report) -> tuple[Tensor, Report]:
+    """What was computed of ``work`` in the type of ``problem``."""
+    if work is problem:  # fixed vertices are where it says
+        return pos, report
     return rounded(problem, pos), replace(report, acc=report.acc.to(problem.state.pos.dtype))
 
 
@@ -269,34 +310,27 @@ def run(system: System, like: Tensor, settings: NewtonSettings, began: float, pr
     """The iterations of ``system``: positions (V, 3) and a report in the precision and on the device of ``like``."""
     phi = system.phi
     finite, stuck, why = [math.isfinite(value) for value in phi], [False] * len(phi), MOST_ITERATIONS
-    history: list[Progress] = []
+    course: list[Iteration] = []
     iteration = 0
     while True:
         residual = system.model()
         finite = [sound and math.isfinite(value) for sound, value in zip(finite, residual, strict=True)]
         wanted = [sound and value > settings.target_rg for sound, value in zip(finite, residual, strict=True)]
         active = [scene and not halted for scene, halted in zip(wanted, stuck, strict=True)]
-        history.append(Progress(time.perf_counter() - began, _tensor(like, system.phi), _tensor(like, residual)))
-        late = settings.budget_ms is not None and 1e3 * history[-1].seconds > settings.budget_ms
+        course.append(Iteration(time.perf_counter() - began, system.phi, residual))
+        late = settings.budget_ms is not None and 1e3 * course[-1].seconds > settings.budget_ms
         if late or iteration >= settings.max_iterations or not any(active):
             why = LATE if late else why
             break
-        if proceed is not None and not proceed(history[-1], system.state()[0]):
+        if proceed is not None and not proceed(course[-1].on(like.device), system.state()[0]):
             why = STOPPED
             break
         moved = system.move(residual, active)
         stuck = [halted or (scene and not went) for halted, scene, went in zip(stuck, active, moved, strict=True)]
         iteration += 1
     reason = tuple(reason_of(*scene, otherwise=why) for scene in zip(finite, wanted, stuck, strict=True))
-    last = history[-1]
-    converged = torch.tensor([not left for left in reason], device=like.device)
     pos, acc = system.state()
-    return pos, Report(iteration, system.used, last.phi, last.relative_gradient, converged, reason, acc, history)
-
-
-def _tensor(like: Tensor, values: list[float]) -> Tensor:
-    # One number is filled in at half the price of a list.
-    return like.new_full((1,), values[0]) if len(values) == 1 else like.new_tensor(values)
+    return pos, Report(iteration, system.used, reason, acc, course)
 
 
 def reason_of(finite: bool, wanted: bool, stuck: bool, otherwise: str) -> str:

@@ -250,11 +250,11 @@ class StepFigures:
         energies = {name: float(value[0]) for name, value in found.items()}
         others = compiled_elements.split(self._potential)[0]
         single, rest = vertices.split(others)
-        known = vertices.known(single, problem)
-        if known.names is not None:
-            others, step = rest, problem.step
-            parts = known.forces.compiled.add(pos, acc, problem.cloth.vertex_scene, step.dt, gradient)
-            for name, value in zip(known.names, parts[:, 0].tolist(), strict=True):
+        names = vertices.part_names(single, problem)
+        if names is not None:
+            others, step, forces = rest, problem.step, vertices.known_forces(single, problem)
+            parts = forces.compiled.add(pos, acc, problem.cloth.vertex_scene, step.dt, gradient)
+            for name, value in zip(names, parts[:, 0].tolist(), strict=True):
                 if name:  # contact on both sides of a fold is two parts of one term
                     energies[name] = energies.get(name, 0.0) + value
         if not others.active(problem):

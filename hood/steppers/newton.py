@@ -6,7 +6,7 @@ off, where they leave it in the skin (:mod:`hood.contact.further`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -18,7 +18,7 @@ from hood.cloth.state import State, StepInput
 from hood.contact.contact import Contact
 from hood.energies.potential import Potential
 from hood.energies.problem import StepProblem
-from hood.solver.newton import NewtonSettings, Report, minimize
+from hood.solver.newton import Iteration, NewtonSettings, Report, minimize
 from hood.solver.step_figures import reason_number
 from hood.steppers.network import Prediction
 from hood.steppers.protocol import Relaxing, Stopwatch, timed
@@ -191,13 +191,12 @@ class NewtonStepper:
                 iterations += held.iterations
         reached = {
             "solver_iterations": float(iterations),
-            "solver_converged": float(bool(report.converged.all())),
+            "solver_converged": float(not any(report.reason)),
             "solver_reason": reason_number(report.reason),
         }
         entered = None if problem.second_contact is asked.second_contact else problem.second_contact
         held_off = None if problem.contact is asked.contact else problem.contact
-        rg = float(report.relative_gradient.max())
-        return Prediction(pos, report.acc, reached, rg, entered=entered, held_off=held_off)
+        return Prediction(pos, report.acc, reached, report.residual, entered=entered, held_off=held_off)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
@@ -243,16 +242,14 @@ def minimize_held_off(
         pos: (V, 3) m, its minimum.
         report: of ``pos``, which may have missed the minimum; None where it is known to be one.
     """
-    best, least, rounds, spent = HeldOff(problem, pos, report, 0, 0), None, 0, 0
-    misses = torch.zeros(problem.num_scenes, dtype=torch.int64, device=pos.device)
-    if report is not None:
-        misses += ~report.converged.to(misses.device)
+    best, rounds, spent = HeldOff(problem, pos, report, 0, 0), 0, 0
+    again = problem.with_held_off(pos)  # where one minimum has been missed at most
+    if again is problem:
+        return best
+    least = problem.num_in_skin(pos)
+    misses = torch.zeros_like(least) if report is None else (~report.converged).to(least)
     unsolved = misses > 0
-    for _ in range(MOST_RAISED):
-        again = problem.with_held_off(pos, misses < MOST_MISSES)
-        if again is problem:
-            break
-        least = problem.num_in_skin(pos) if least is None else least
+    while again is not problem and rounds < MOST_RAISED:
         problem = again
         pos, found = minimize(potential, problem, pos, settings)
         pos = torch.where(torch.isfinite(pos), pos, best.pos)  # what is no number is missed, and no place to go on from
@@ -266,6 +263,7 @@ def minimize_held_off(
         unsolved = unsolved & ~better
         least = torch.where(better, count, least)
         best = _by_scene(better, HeldOff(problem, pos, found, 0, 0), best)
+        again = problem.with_held_off(pos, misses < MOST_MISSES)
     return best._replace(rounds=rounds, iterations=spent)
 
 
@@ -288,16 +286,10 @@ def _by_scene(better: Tensor, new: HeldOff, old: HeldOff) -> HeldOff:
 
 
 def _merged(better: Tensor, rows: Tensor, new: Report, old: Report) -> Report:
-    reason = tuple(one if taken else other for taken, one, other in zip(better.tolist(), new.reason, old.reason, strict=True))
+    def chosen(one: Iterable[Any], other: Iterable[Any]) -> list[Any]:
+        return [a if taken else b for taken, a, b in zip(better.tolist(), one, other, strict=True)]
 
-    def chosen(one: Tensor, other: Tensor) -> Tensor:
-        return torch.where(better, one, other)
-
-    return replace(
-        new,
-        phi=chosen(new.phi, old.phi),
-        relative_gradient=chosen(new.relative_gradient, old.relative_gradient),
-        converged=chosen(new.converged, old.converged),
-        reason=reason,
-        acc=torch.where(rows.unsqueeze(1), new.acc, old.acc),
-    )
+    end, then = new.course[-1], old.course[-1]
+    end = Iteration(end.seconds, chosen(end.phi, then.phi), chosen(end.relative_gradient, then.relative_gradient))
+    acc = torch.where(rows.unsqueeze(1), new.acc, old.acc)
+    return replace(new, reason=tuple(chosen(new.reason, old.reason)), acc=acc, course=[*new.course[:-1], end])

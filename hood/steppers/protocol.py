@@ -156,17 +156,13 @@ class Stopwatch:
         self._asides: dict[str, float] = {}
         self._start = clock()
 
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
+    def part(self, name: str) -> AbstractContextManager[None]:
         """Count the time of the block as ``name``. On CUDA the block, and what was begun before it, is waited for."""
-        with self._counted(self._parts, name):
-            yield
+        return self._counted(self._parts, name)
 
-    @contextmanager
-    def aside(self, name: str) -> Iterator[None]:
+    def aside(self, name: str) -> AbstractContextManager[None]:
         """The block is no part of the frame: its time is kept apart, for :meth:`spent_aside`."""
-        with self._counted(self._asides, name):
-            yield
+        return self._counted(self._asides, name)
 
     def spent_aside(self, name: str) -> float:
         """Milliseconds since the last lap in blocks set aside as ``name``."""

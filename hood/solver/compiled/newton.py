@@ -210,7 +210,8 @@ def compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
 
 
 def _compiled_step(potential: Potential, problem: StepProblem) -> CompiledStep:
-    active = potential.active(problem)
+    potential = potential.settled(problem)
+    active = potential.terms
     hinges = [term.closed_form(problem) for term in having(active, Form.HINGES).values()]
     forces: VertexForces = known_forces(potential, problem)
     bending = next((form for form in hinges if form.damping is None), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,17 @@ from torch import Tensor
 
 from hood.cloth.cloth import Cloth
 from hood.contact.self_contact import SceneLayers
-from hood.energies.potential import Potential
-from hood.energies.problem import STANDARD_GRAVITY, StepProblem
+from hood.energies.potential import Potential, weight_norms
+from hood.energies.problem import StepProblem
 from hood.energies.self_contact import LayerGrips
 from hood.mesh.cloth_proximity import EASED, LEFT
-from hood.native.arguments import POINTER, REAL, num_parts
+from hood.native.arguments import POINTER, REAL, address_of, num_parts
 from hood.native.build import BuildError
 from hood.solver.compiled.newton import (
     _ROWS,
     ENERGY_CALLBACK,
     MODEL_CALLBACK,
     CompiledStep,
-    Fabric,
     _array,
     _Engine,
     _LayerGrips,
@@ -49,7 +49,8 @@ class CompiledScene:
         self.step: CompiledStep | None = None  # what was taken up last
         self._kept: dict[str, Any] = {}  # what the structure points to
         self._others: _OtherForces | None = None
-        self._fabric: tuple[tuple[Tensor | float | None, ...], Fabric] | None = None
+        self._slots: np.ndarray | None = None
+        self._fabric: tuple[int, tuple[Tensor | None, ...]] | None = None  # what the elements depend on
         self.values = _Engine(
             num_vertices=len(tables.vertex),
             num_rows=tables.num_rows,
@@ -85,6 +86,7 @@ class CompiledScene:
         self._point(**{name: np.zeros((rows, 4)) for name in ("acc", "trial_acc", "gradient", "direction")})
         self._point(face_force=np.zeros((self.values.num_faces, 10)), hinge_force=np.zeros((self.values.num_hinges, 14)))
         self._memory: dict[tuple[bool, int], dict[str, np.ndarray]] = {}
+        self._form: tuple[bool, int] | None = None  # whose memory the structure points to
         self.share(1)
 
     def share(self, parts: int) -> None:
@@ -95,7 +97,9 @@ class CompiledScene:
     def widen(self, wide: bool) -> None:
         """Matrix and linear solver in float64, or in float32."""
         key = (wide, self.values.parts)
-        self.wide, self._lib = wide, library(wide)
+        if key == self._form:
+            return
+        self._form, self.wide, self._lib = key, wide, library(wide)
         if key not in self._memory:
             self._memory[key] = self._working_memory()
         self._point(**self._memory[key])
@@ -158,12 +162,13 @@ class CompiledScene:
         if scene is None:
             self.values.layers = None
             return
-        vertex = self.tables.vertex - scene.first
         slots = 2 * self.values.num_pairs
-        number = np.full(len(vertex), slots)
-        number[vertex[: self.values.num_rows]] = self.tables.pairs.slot
-        self._point(vertex_of_scene=vertex)
-        self.values.layers = scene.layers.number(number, slots)
+        if self._slots is None:  # of every vertex of the scene
+            vertex = self.tables.vertex - scene.first
+            self._slots = np.full(len(vertex), slots)
+            self._slots[vertex[: self.values.num_rows]] = self.tables.pairs.slot
+            self._point(vertex_of_scene=vertex)
+        self.values.layers = scene.layers.number(self._slots, slots)
         self.values.kept, self.values.eased = LEFT, EASED
 
     def _take_layer_grips(self, grips: LayerGrips | None, scene: int, num_vertices: int) -> None:
@@ -254,19 +259,18 @@ class CompiledScene:
     def _take_fabric(self, step: CompiledStep) -> None:
         cloth = step.cloth
         now = (cloth.rest_inverse, cloth.rest_area, cloth.thickness, cloth.lame_mu, cloth.lame_lambda, cloth.bending_stiffness,
-               cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, cloth.weave, float(step.membrane))  # fmt: skip
-        known = self._fabric
-        if known is None or not all(_identical(a, b) for a, b in zip(now, known[0], strict=True)):
-            self._fabric = known = now, build_fabric(cloth, self.tables, float(step.membrane))
-        fabric = {("lambda" if name == "lam" else name): value for name, value in vars(known[1]).items()}
+               cloth.rest_angle, cloth.hinge_rest_length, cloth.hinge_area, cloth.weave)  # fmt: skip
+        if self._fabric is not None and self._fabric[0] == step.membrane and all(map(is_, now, self._fabric[1])):
+            return
+        self._fabric, made = (step.membrane, now), build_fabric(cloth, self.tables, float(step.membrane))
+        fabric = {("lambda" if name == "lam" else name): value for name, value in vars(made).items()}
         self.values.weave = None
         self._point(**{name: value for name, value in fabric.items() if value is not None})
 
     def _point(self, **arrays: np.ndarray) -> None:
         for name, array in arrays.items():
-            assert array.flags.c_contiguous, f"{name} has gaps"
             self._kept[name] = array
-            setattr(self.values, name, array.ctypes.data)
+            setattr(self.values, name, address_of(array))
 
 
 class _ScenePoints:
@@ -349,10 +353,6 @@ def _aligned(count: int, kind: type) -> np.ndarray:
     return memory[begin : begin + size].view(kind)
 
 
-def _identical(a: object, b: object) -> bool:
-    return a is b or (isinstance(a, float) and a == b)
-
-
 def compiled_scenes(problem: StepProblem, plan: SolverPlan) -> list[CompiledScene]:
     """The engines of a cloth's scenes, made once per plan; ``problem`` has the plan's cloth and attachments."""
     engines = plan.cache.get("engines")
@@ -372,10 +372,9 @@ class CompiledSystem:
         self._step = compiled_step(potential, problem)
         for scene, engine in enumerate(self._engines):
             engine.enter(self._step, scene)
-        self._dt_sq = _array(problem.vertex_dt**2)
-        gravity = float(problem.gravity.norm()) or STANDARD_GRAVITY
-        weight = problem.cloth.free * problem.cloth.mass * gravity
-        self._weight = problem.sum_vertices(weight**2).sqrt().tolist()
+        dt = problem.step.dt.unsqueeze(1) if problem.num_scenes == 1 else problem.vertex_dt
+        self._dt_sq = _array(dt**2)
+        self._weight = weight_norms(problem)
 
     def begin(self, start: Tensor | None) -> None:
         """Take up positions (V, 3), or the better of the two first guesses; near them where cloth would meet cloth."""

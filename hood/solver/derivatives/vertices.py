@@ -110,8 +110,8 @@ class VertexForces:
 
 def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = False) -> VertexForces:
     """The potential's terms of :data:`hood.energies.term.VERTEX_FORMS`; ``compiled`` may leave torch."""
-    mass, pos = problem.cloth.mass, problem.state.pos
-    inertia, weight = torch.zeros_like(mass), torch.zeros_like(pos)
+    inertia: Tensor | None = None
+    weight: Tensor | None = None
     walls: list[Walls] = []
     grips: list[Grip] = []
     passes: dict[int, ContactPass | None] = {}
@@ -124,13 +124,15 @@ def vertex_forces(potential: Potential, problem: StepProblem, compiled: bool = F
     for term in having(potential.active(problem), *VERTEX_FORMS).values():
         found = term.closed_form(problem, pass_of if compiled else None)
         if term.form is Form.MASS:
-            inertia = inertia + found
+            inertia = found if inertia is None else inertia + found
         elif term.form is Form.WEIGHT:
-            weight = weight + found
+            weight = found if weight is None else weight + found
         elif term.form is Form.PLANES:
             walls += found
         else:
             grips += found
+    inertia = torch.zeros_like(problem.cloth.mass) if inertia is None else inertia
+    weight = torch.zeros_like(problem.state.pos) if weight is None else weight
     return VertexForces(inertia[:, None], inertia / problem.vertex_dt.squeeze(1) ** 2, weight, tuple(walls), tuple(grips))
 
 
@@ -151,41 +153,37 @@ def _friction(grip: Grip, pos: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class KnownForces(NamedTuple):
-    """Forces of a step, the terms that they are of, and the names in the order of :meth:`VertexForces.energies`."""
+    """Forces of a step, and the terms that they are of."""
 
     problem: weakref.ref[StepProblem]
     versions: tuple[int, ...] | None
     terms: dict[str, Term]
     forces: VertexForces
-    names: list[str] | None  # None where several terms are added up into one
 
 
 #: Of the last steps that were asked about, as long as these live: by the solver, and by those who measure.
 _KNOWN: dict[int, KnownForces] = {}
 
 
+@torch.no_grad()
 def known_forces(potential: Potential, problem: StepProblem) -> VertexForces:
     """What :func:`vertex_forces` gathers, once for a step and the same terms."""
-    return known(potential, problem).forces
-
-
-@torch.no_grad()
-def known(potential: Potential, problem: StepProblem) -> KnownForces:
-    """The same, with the terms that they are of."""
     key, versions, terms = id(problem), problem.versions(), having(potential.terms, *VERTEX_FORMS)
     last = _KNOWN.get(key)
     if last is None or last.problem() is not problem or last.versions != versions or not _same(last.terms, terms):
-        found, names = vertex_forces(potential, problem, compiled=True), _names(potential.only(terms).active(problem), problem)
-        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), versions, terms, found, names)
-    return last
+        found = vertex_forces(potential, problem, compiled=True)
+        last = _KNOWN[key] = KnownForces(weakref.ref(problem, forget(_KNOWN, key)), versions, terms, found)
+    return last.forces
 
 
 def _same(terms: Mapping[str, Term], others: Mapping[str, Term]) -> bool:
     return list(terms) == list(others) and all(a is b for a, b in zip(terms.values(), others.values(), strict=True))
 
 
-def _names(terms: Mapping[str, Term], problem: StepProblem) -> list[str] | None:
-    """Names of terms in the order of :meth:`VertexForces.energies`, "" for none; None where two share a place."""
+def part_names(potential: Potential, problem: StepProblem) -> list[str] | None:
+    """Names of the potential's terms in the order of :meth:`VertexForces.energies`, "" for none; None where several are added
+    up into one."""
+    terms = potential.active(problem)
     inertia, gravity = ([*having(terms, form)] for form in (Form.MASS, Form.WEIGHT))
     if max(len(inertia), len(gravity)) > 1:
         return None
@@ -262,8 +260,7 @@ def _single(
     potential: Potential, problem: StepProblem, pos: Tensor, acc: Tensor, slope: bool
 ) -> tuple[dict[str, Tensor], Tensor | None]:
     """Energies [J] (B,) by term of those that act on single vertices, and their gradient [N] (V, 3) where asked for."""
-    once = known(potential, problem)
-    forces, names = once.forces, once.names
+    forces, names = known_forces(potential, problem), part_names(potential, problem)
     if names is None:
         alone = (potential.only({name: term}) for name, term in potential.active(problem).items())
         energies = {name: value for part in alone for name, value in _single(part, problem, pos, acc, slope=False)[0].items()}

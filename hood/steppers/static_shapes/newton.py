@@ -15,7 +15,7 @@ from hood.cloth.cloth import Cloth
 from hood.energies.potential import Potential, keeps_both_sides
 from hood.energies.problem import StepProblem
 from hood.solver.derivatives.vertices import terms_without_form
-from hood.solver.newton import NewtonSettings, Report, reason_of, run
+from hood.solver.newton import Iteration, NewtonSettings, Report, reason_of, run
 from hood.solver.step_figures import MOST_ITERATIONS, reason_number
 from hood.solver.system.iterate import Proceed, rounded
 from hood.solver.system.plan import plan_for
@@ -93,10 +93,10 @@ class CapturedNewton:
             pos, report = self._minimize(self.stepper.potential, problem, settings=self.stepper.settings)
         reached = {
             "solver_iterations": float(report.iterations),
-            "solver_converged": float(bool(report.converged.all())),
+            "solver_converged": float(not any(report.reason)),
             "solver_reason": reason_number(report.reason),
         }
-        return Prediction(pos, report.acc, reached, float(report.relative_gradient.max()))
+        return Prediction(pos, report.acc, reached, report.residual)
 
     def next_velocity(self, problem: StepProblem, prediction: Prediction) -> Tensor:
         """(V, 3) m/s at t + 1: (x_{t+1} − x_t) / dt."""
@@ -214,11 +214,12 @@ class _Frame(_Fixed):
         gradients the most that there can have been."""
         assert start is proceed is None, "all iterations are one function"
         settings, (pos, acc, residual) = self._settings, (value.clone() for value in self._reached)
-        left = [(math.isfinite(value), value > settings.target_rg) for value in residual.tolist()]
+        reached: list[float] = residual.tolist()
+        left = [(math.isfinite(value), value > settings.target_rg) for value in reached]
         reason = tuple(reason_of(finite, wanted, False, MOST_ITERATIONS) for finite, wanted in left)
-        converged = residual <= settings.target_rg
-        used, phi = settings.max_iterations * settings.cg_iterations, torch.full_like(residual, torch.nan)
-        return pos, Report(settings.max_iterations, used, phi, residual, converged, reason, acc)
+        used = settings.max_iterations * settings.cg_iterations
+        end = Iteration(time.perf_counter() - began, [math.nan] * len(reached), reached)
+        return pos, Report(settings.max_iterations, used, reason, acc, [end])
 
 
 class _Plan(_Fixed):
