@@ -124,7 +124,7 @@ def _first_touch(
         whole = length[rows]
         share = gone / whole
         places = pos[rows] + share.unsqueeze(1) * way[rows]
-        skin = match_surface(places, vertex_scene[rows], obstacle).dist
+        skin = signed_distance(places, vertex_scene[rows], obstacle.pos, obstacle)
         plane = ((places - contact.point[rows]) * contact.normal[rows]).sum(dim=1)
         hidden = ~contact.valid[rows] | (plane - skin > HIDDEN)
         touches = (skin < _NEAR) & hidden

@@ -73,8 +73,8 @@ class Walls:
 
     def take(self, rows: Tensor) -> Walls:
         """Those of some rows."""
-        weight = self.weight[rows] if isinstance(self.weight, Tensor) and self.weight.ndim else self.weight
-        return Walls(weight, self.point[rows], self.normal[rows], self.reach[rows])
+        weight = self.weight.index_select(0, rows) if isinstance(self.weight, Tensor) and self.weight.ndim else self.weight
+        return Walls(weight, *(values.index_select(0, rows) for values in (self.point, self.normal, self.reach)))
 
 
 class Collision(Energy):

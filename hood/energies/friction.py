@@ -45,7 +45,7 @@ class Grip:
 
     def take(self, rows: Tensor) -> Grip:
         """Those of some rows."""
-        return Grip(self.force[rows], self.normal[rows], self.anchor[rows], self.limit[rows])
+        return Grip(*(values.index_select(0, rows) for values in (self.force, self.normal, self.anchor, self.limit)))
 
 
 class LaggedFriction(Energy):

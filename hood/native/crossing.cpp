@@ -225,22 +225,7 @@ struct Rows {
 
 // Everything about a mesh that depends on the topology, from centres (F, 3) of the faces; ``order`` holds their numbers.
 void crossing_order(Eights* e, const double* centre) {
-    struct {
-        int32_t begin, end;
-    } left[64];
-    int count = 0;
-    left[count++] = {0, (int32_t)e->num_faces};
-    while (count) {
-        const auto now = left[--count];
-        const int32_t leaves = (now.end - now.begin + LANES - 1) / LANES;
-        if (leaves <= 1) continue;
-        // The first part is full on all levels: groups are eights of leaves from the first one on.
-        int32_t part = 1;
-        while (2 * part < leaves) part *= 2;
-        const int32_t middle = now.begin + LANES * part;
-        halve(e->order, now.begin, middle, now.end, centre);
-        left[count++] = {now.begin, middle}, left[count++] = {middle, now.end};
-    }
+    order_leaves(e->order, (int32_t)e->num_faces, LANES, centre);
     for (int64_t i = 0; i < LANES * e->num_leaves; ++i) {
         int64_t vertex[3] = {0, 0, 0};
         if (i < e->num_faces) std::copy(e->faces + 3 * (int64_t)e->order[i], e->faces + 3 * (int64_t)e->order[i] + 3, vertex);

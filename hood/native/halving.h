@@ -23,4 +23,24 @@ inline void halve(int32_t* order, int32_t begin, int32_t middle, int32_t end, co
     });
 }
 
+// Orders the items 0 to ``count``, in leaves of so many, that groups of eight leaves, and of eight of these, lie together: the first
+// half is full on all levels.
+inline void order_leaves(int32_t* order, int32_t count, int32_t wide, const double* centre) {
+    struct {
+        int32_t begin, end;
+    } left[64];
+    int size = 0;
+    left[size++] = {0, count};
+    while (size) {
+        const auto now = left[--size];
+        const int32_t leaves = (now.end - now.begin + wide - 1) / wide;
+        if (leaves <= 1) continue;
+        int32_t part = 1;
+        while (2 * part < leaves) part *= 2;
+        const int32_t middle = now.begin + wide * part;
+        halve(order, now.begin, middle, now.end, centre);
+        left[size++] = {now.begin, middle}, left[size++] = {middle, now.end};
+    }
+}
+
 }  // namespace

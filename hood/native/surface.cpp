@@ -1,9 +1,9 @@
 // Closest points on a triangle surface by a tree of boxes: built once for a topology, refitted to the positions of every call.
 //
 // The search is exact, and its result does not depend on the tree, on the searches before it, or on the order of faces visited: of
-// faces at the same distance the one with the lowest number is taken. Distances are float64. A point goes down to the leaf whose
-// boxes look nearest, which bounds its distance, and lists the other leaves within that bound before it looks into any of them:
-// lists that grow without a branch are several times as fast as a branch at every box.
+// faces at the same distance the one with the lowest number is taken. Distances are float64. The faces of one leaf bound the distance
+// of a point; then all boxes within that bound are listed, level by level: lists that grow without a branch are several times as
+// fast as a branch at every box. Boxes are float32, about the middle of the surface, and their distances are taken as that much less.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "eights.h"
 #include "halving.h"
 #include "lanes.h"
 #include "threads.h"
@@ -18,12 +19,15 @@
 
 namespace {
 
-constexpr int WIDE = LANES;  // children of a node, faces of a leaf, vertices of a block
+constexpr int WIDE = LANES;  // children of a group, faces of a leaf
+constexpr int BLOCK = AT_ONCE < 4 ? 4 : AT_ONCE;  // vertices of a block: a leaf has four, more or less
 constexpr int MOST = 64;  // points of a batch
-constexpr double EPS = 2.220446049250313e-16, TINY = 2.2250738585072014e-308;
+constexpr int MOST_PAIRS = 256;  // faces and points that are tried together
+constexpr double TINY = 2.2250738585072014e-308;
 constexpr double NONE = 1e300;  // the number of no face and of no vertex
 
 typedef float F8 __attribute__((vector_size(32)));
+typedef float F4 __attribute__((vector_size(16)));
 typedef float FN __attribute__((vector_size(4 * AT_ONCE)));
 
 // The second where one is not a number.
@@ -38,13 +42,6 @@ inline double least_lane(VN v) {
     for (int half = AT_ONCE / 4; half; half /= 2)
         for (int i = 0; i < half; ++i) low[i] = low[i + half] < low[i] ? low[i + half] : low[i];
     return low[0];
-}
-
-// The least of what is made for every part of eight lanes, beginning at its number.
-template <class Part> inline double least_of(const Part& part) {
-    VN low = part(0);
-    for (int i = AT_ONCE; i < WIDE; i += AT_ONCE) low = least(part(i), low);
-    return least_lane(low);
 }
 
 inline void put(double* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
@@ -62,33 +59,27 @@ inline Axes load_axes(const double* p) { return {load<VN>(p), load<VN>(p + WIDE)
 
 extern "C" {
 
-// A node or a leaf that a point of a batch is to visit.
-struct Visit {
-    int32_t walk, item;
-};
-
 struct Tree {
-    int64_t num_faces, num_vertices, num_nodes, num_leaves, num_blocks, edge_width;
+    int64_t num_faces, num_vertices, num_leaves, num_blocks, edge_width;
     // The topology. Places are those of faces in the order: leaf times eight and lane.
     const int64_t* faces;                     // (G, 3)
     const int64_t *around, *first, *valence;  // (3G), (W), (W), see hood.mesh.closest_point.search.Incidence
     const int64_t *face_edges, *edge_faces;   // (G, 3), (E, M) with -1
     int32_t* order;         // (L, 8) the faces in the tree, leaf after leaf; the last one is repeated
     int32_t* place;         // (G) where they are in it, -1 for others
-    int32_t* children;      // (M, 8) nodes, or -1 - leaf; the node itself where there is none
     double* number;         // (L, 8) the order again
     int32_t* corner_of;     // (L, 3, 8) corners of the faces of a leaf
     int32_t* block_first;   // (L + 1) blocks of a leaf: vertices of its faces, each in one leaf; the last one of a leaf is repeated
-    int32_t* block_vertex;  // (B, 8)
-    double* block_number;   // (B, 8) the same
+    int32_t* block_vertex;  // (B, BLOCK)
+    double* block_number;   // (B, BLOCK) the same
     int32_t *fan_first, *fan;  // (W + 1), (9G) corners of the faces around a vertex: two that follow each other belong to a face
     double* fan_share;         // (9G) what a corner counts in the average over the corners of these faces
     // The positions of this call.
     double* pos;                      // (W, 3) m
     double* corners;                  // (L, 9, 8) m, corners of the faces of a leaf
-    double* boxes;                    // (M, 6, 8) m, least and greatest corners of the children
-    float* face_boxes;                // (L, 6, 8) m, those of the faces of a leaf, about the origin
-    double* block_pos;                // (B, 3, 8) m
+    float* face_boxes;                // (L, 6, 8) m, least and greatest corners of the faces of a leaf, about the origin
+    float* boxes;                     // (M, 6, 8) m, those of eight leaves, then of eight of these, level after level
+    double* block_pos;                // (B, 3, BLOCK) m
     double* vertex_normal;            // (W, 6) unit normals, now and next, of the vertices that this call needed
     double* bulge;                    // (2, W) 1/m, their curvatures before an average and after it
     int32_t* needed;                  // (W + 1) these vertices
@@ -97,12 +88,11 @@ struct Tree {
     double origin[3], size_sq;        // m, m^2: middle of everything, and how far that reaches
     int64_t batch;                    // points that are searched for together, at most 64
     int64_t parts;                    // in which the points of a call are searched for, by threads
-    double* leaf_normals;             // (L, 3, 8) unit normals of the faces of a leaf
-    double* normal_boxes;             // (M, 6, 8) least and greatest of these below the children
+    float* leaf_normals;              // (L, 3, 8) unit normals of the faces of a leaf
+    float* normal_boxes;              // (M, 6, 8) least and greatest of these, as the boxes
     int64_t normals_of;               // the fit, see fits, that these are of
     int64_t fits;                     // how often positions were taken up
-    Visit *nodes, *leaves;            // (parts, batch * L + 1) each, what points of a batch are to visit
-    double* reach;                    // (parts, batch * L + 1) m^2, to the boxes of these leaves
+    uint64_t *visits, *next_visits, *near;  // (parts, batch * L + 8) each, what points of a batch are to visit, see Visit
 };
 
 // The nearest surface points of the points of a query, and what another side of a fold is.
@@ -122,7 +112,7 @@ struct Query {
     double* curvature;       // (N) 1/m, none where nobody asks
     double most_curvature;   // 1/m
     int64_t rounds;          // of averaging
-    const int64_t* hint;     // (N) vertices that are near, as those found a step before: they save visits; none where none is known
+    const int64_t* hint;     // (N) faces that are near, as those found a step before: they save visits; none where none is known
 };
 }
 
@@ -204,24 +194,6 @@ inline Found first_of(const Least& least) {
 
 inline Axes everywhere(Vec p) { return {every(p.x), every(p.y), every(p.z)}; }
 
-inline void try_faces(const Tree& tree, Vec point, int64_t leaf, Least& best) {
-    const Axes p = everywhere(point);
-    for (int i = 0; i < WIDE; i += AT_ONCE) {
-        const double* table = tree.corners + 9 * WIDE * leaf + i;
-        const Axes a = load_axes(table), b = load_axes(table + 3 * WIDE), c = load_axes(table + 6 * WIDE);
-        best.take(triangle_dist_sq(p - a, b - a, c - a), load<VN>(tree.number + WIDE * leaf + i));
-    }
-}
-
-inline void try_vertices(const Tree& tree, Vec point, int64_t leaf, Least& best) {
-    const Axes p = everywhere(point);
-    for (int64_t block = tree.block_first[leaf]; block < tree.block_first[leaf + 1]; ++block)
-        for (int i = 0; i < WIDE; i += AT_ONCE) {
-            const Axes gap = p - load_axes(tree.block_pos + 3 * WIDE * block + i);
-            best.take(dot(gap, gap), load<VN>(tree.block_number + WIDE * block + i));
-        }
-}
-
 // Squared distances to boxes; not a number where there is no box.
 template <class V, class T> inline V box_dist_sq(const T* box, T x, T y, T z) {
     const V zero{};
@@ -232,138 +204,150 @@ template <class V, class T> inline V box_dist_sq(const T* box, T x, T y, T z) {
 }
 
 // Squared distances of boxes beyond this cannot belong to anything within the distance, whatever rounding does: with an error
-// of e, (d + e)^2 <= d^2 (1 + 1e-6) + e^2 (1 + 1e6). Coordinates of size s have e < 4e-15 s in float64 and e < 4e-7 s in float32.
-inline double limit_of(double dist_sq, double size_sq) { return dist_sq * (1.0 + 1e-6) + 1.6e-23 * size_sq; }
-inline float face_limit_of(double dist_sq, double size_sq) { return (float)(dist_sq * (1.0 + 1e-3) + 1.6e-10 * size_sq + 1e-37); }
+// of e, (d + e)^2 <= d^2 (1 + 1e-3) + e^2 (1 + 1e3). Coordinates of size s have e < 4e-7 s in float32.
+inline float limit_of(double dist_sq, double size_sq) { return (float)(dist_sq * (1.0 + 1e-3) + 1.6e-10 * size_sq + 1e-37); }
 
 // A point of a batch on its way.
 struct Walk {
-    Vec p, local;  // local: about the tree's origin
-    double size_sq, limit;
-    double known_sq;  // m^2, to a vertex that was nearest before; infinite where none is known
-    Least faces, vertices;
-    int64_t node, parent;
-    float face_limit;
+    Vec p;
+    float x, y, z;  // about the tree's origin
+    float limit, face_limit;
+    Found face;
+    Least vertices;
+    int64_t leaf;  // whose faces were tried first
 };
 
-inline void walk_from(Walk& walk, const Tree& tree, Vec p) {
-    walk.p = p, walk.local = p - at(tree.origin, 0);
-    walk.size_sq = tree.size_sq + dot(walk.local, walk.local);
-    walk.faces = walk.vertices = Least{};
-    walk.known_sq = INFINITY;
-    walk.node = tree.num_nodes ? 0 : -1;
-    walk.parent = -1;
+inline void place_walk(const Tree& tree, Walk& walk, Vec p) {
+    walk.p = p;
+    // Of places farther than this the limits are infinite: every box is within them, as long as distances are numbers.
+    const auto local = [&](double x, int k) { return (float)std::min(std::max(x - tree.origin[k], -1e38), 1e38); };
+    walk.x = local(p.x, 0), walk.y = local(p.y, 1), walk.z = local(p.z, 2);
 }
 
-// To the children of a node from the i-th on.
-inline VN children_dist_sq(const Tree& tree, int64_t node, Vec p, int i) {
-    return box_dist_sq<VN>(tree.boxes + 6 * WIDE * node + i, p.x, p.y, p.z);
+inline F8 boxes_dist_sq(const float* boxes, const Walk& walk) { return box_dist_sq<F8>(boxes, walk.x, walk.y, walk.z); }
+
+// The leaf whose boxes look nearest on the way down; positive floats are ordered as integers are, and the last three bits hold the
+// lane.
+int64_t likely_leaf(const Tree& tree, const Levels& levels, const Walk& walk) {
+    int64_t group = 0;
+    for (int level = levels.count - 1; level >= 0; --level) {
+        alignas(32) int32_t key[WIDE];
+        store(key, boxes_dist_sq(tree.boxes + 6 * WIDE * (levels.first[level] + group), walk));
+        for (int i = 0; i < WIDE; ++i) key[i] = (key[i] & ~(INT32_MIN | 7)) | i;
+        for (int half = WIDE / 2; half; half /= 2)
+            for (int i = 0; i < half; ++i) key[i] = std::min(key[i], key[i + half]);
+        group = WIDE * group + (key[0] & 7);
+    }
+    return group;
 }
 
-// On to the child that looks nearest; positive doubles are ordered as integers are, and the last three bits hold the lane.
-inline void go_down(const Tree& tree, Walk& walk) {
-    alignas(64) int64_t key[WIDE];
+// Begins at a leaf: its faces bound the distance, and their corners that of the nearest vertex.
+void begin_at(const Tree& tree, Walk& walk, int64_t leaf) {
+    const Axes p = everywhere(walk.p);
+    Least faces;
+    VN corner_sq = every(INFINITY);
     for (int i = 0; i < WIDE; i += AT_ONCE) {
-        IN number;
-        for (int lane = 0; lane < AT_ONCE; ++lane) number[lane] = i + lane;
-        store(key + i, ((IN)children_dist_sq(tree, walk.node, walk.p, i) & ~(INT64_MIN | 7)) | number);
+        const double* table = tree.corners + 9 * WIDE * leaf + i;
+        const Axes a = load_axes(table), b = load_axes(table + 3 * WIDE), c = load_axes(table + 6 * WIDE);
+        faces.take(triangle_dist_sq(p - a, b - a, c - a), load<VN>(tree.number + WIDE * leaf + i));
+        for (const Axes& corner : {p - a, p - b, p - c}) corner_sq = least(dot(corner, corner), corner_sq);
     }
-    for (int half = WIDE / 2; half; half /= 2)
-        for (int i = 0; i < half; ++i) key[i] = std::min(key[i], key[i + half]);
-    walk.parent = walk.node;
-    walk.node = tree.children[WIDE * walk.node + (key[0] & 7)];
+    const Vec local = walk.p - at(tree.origin, 0);
+    const double size_sq = tree.size_sq + dot(local, local);
+    walk.leaf = leaf, walk.face = first_of(faces), walk.vertices = Least{};
+    walk.face_limit = limit_of(walk.face.dist_sq, size_sq);
+    walk.limit = std::max(limit_of(least_lane(corner_sq), size_sq), walk.face_limit);
 }
 
-// Lists the children of a node whose boxes are within the limit, but for one: nodes to visit, and leaves with their distances.
-inline void list_children(const Tree& tree, const Walk& walk, int32_t number, int64_t node, int64_t except, int64_t& nodes, int64_t& leaves) {
-    alignas(64) double away[WIDE];
-    for (int i = 0; i < WIDE; i += AT_ONCE) store(away + i, children_dist_sq(tree, node, walk.p, i));
-    const int32_t* child = tree.children + WIDE * node;
-    Visit *const to_nodes = tree.nodes, *const to_leaves = tree.leaves;
-    double* const reach = tree.reach;
-    const double limit = walk.limit;
-    int64_t n = nodes, m = leaves;
-    unsigned within = 0;
-    for (int i = 0; i < WIDE; ++i) within |= (unsigned)(away[i] <= limit && child[i] != except) << i;
-    for (; within; within &= within - 1) {
-        const int i = __builtin_ctz(within);
-        if (child[i] < 0)
-            to_leaves[m] = {number, -1 - child[i]}, reach[m++] = away[i];
-        else
-            to_nodes[n++] = {number, child[i]};
+// What a point of a batch is to visit: a group, a leaf or the place of a face, and the point's number in the last bits.
+typedef uint64_t Visit;
+constexpr Visit ITEM = MOST;
+
+inline Visit first_below(Visit visit) { return visit / ITEM * ITEM * (WIDE - 1) + visit; }
+
+// Lists what is below a visit in the lanes that hold, without a branch.
+template <class Mask> inline void list_lanes(Mask mask, Visit first, Visit* list, int64_t& count) {
+    alignas(sizeof(Mask)) int32_t lane[WIDE];
+    store(lane, mask);
+    for (int i = 0; i < WIDE; ++i) {
+        list[count] = first + i * ITEM;
+        count -= lane[i];
     }
-    nodes = n, leaves = m;
 }
 
-inline bool may_hold(const Tree& tree, const Walk& walk, int64_t leaf) {
-    const F8 away = box_dist_sq<F8>(tree.face_boxes + 6 * WIDE * leaf, (float)walk.local.x, (float)walk.local.y, (float)walk.local.z);
-    alignas(32) float lane[WIDE];
-    store(lane, away);
-    int any = 0;
-    for (int i = 0; i < WIDE; ++i) any |= !(lane[i] > walk.face_limit);
-    return any;
+// There is room for a whole register of pairs.
+void try_pairs(const Tree& tree, Walk* walks, Visit* pairs, int64_t count) {
+    if (!count) return;
+    for (int64_t i = count; i % AT_ONCE; ++i) pairs[i] = pairs[count - 1];
+    for (int64_t i = 0; i < count; i += AT_ONCE) {
+        const double *point[AT_ONCE], *corner[3][AT_ONCE];
+        for (int lane = 0; lane < AT_ONCE; ++lane) {
+            const uint64_t place = pairs[i + lane] / ITEM;
+            point[lane] = &walks[pairs[i + lane] % ITEM].p.x;
+            for (int c = 0; c < 3; ++c) corner[c][lane] = tree.pos + 3 * (int64_t)tree.corner_of[WIDE * (3 * (place / WIDE) + c) + place % WIDE];
+        }
+        const auto axes = [](const double* const* row) {
+            return Axes{gather([&](int lane) { return row[lane][0]; }), gather([&](int lane) { return row[lane][1]; }),
+                        gather([&](int lane) { return row[lane][2]; })};
+        };
+        const Axes p = axes(point), a = axes(corner[0]), b = axes(corner[1]), c = axes(corner[2]);
+        alignas(sizeof(VN)) double dist_sq[AT_ONCE];
+        store(dist_sq, triangle_dist_sq(p - a, b - a, c - a));
+        for (int lane = 0; lane < AT_ONCE; ++lane) {
+            Found& best = walks[pairs[i + lane] % ITEM].face;
+            const double number = tree.order[pairs[i + lane] / ITEM];
+            const bool better = (dist_sq[lane] < best.dist_sq) | ((dist_sq[lane] == best.dist_sq) & (number < best.number));
+            best.dist_sq = better ? dist_sq[lane] : best.dist_sq, best.number = better ? number : best.number;
+        }
+    }
 }
 
-// By the vertices looked at so far, and by one that was nearest in another search: that is no farther than the nearest.
-inline void bound_vertices(Walk& walk) {
-    const double dist_sq = least_lane(walk.vertices.dist_sq);
-    walk.limit = limit_of(walk.known_sq < dist_sq ? walk.known_sq : dist_sq, walk.size_sq);
-}
-
-inline void bound_faces(Walk& walk) {
-    const double dist_sq = least_lane(walk.faces.dist_sq);
-    walk.limit = limit_of(dist_sq, walk.size_sq), walk.face_limit = face_limit_of(dist_sq, walk.size_sq);
+// Vertices of the leaves of the k-th visit and of those behind it for the same point; returns where those of another one begin.
+int64_t try_vertices(const Tree& tree, Walk* walks, const Visit* visits, int64_t k, int64_t end) {
+    const Visit number = visits[k] % ITEM;
+    const Axes p = everywhere(walks[number].p);
+    Least best;
+    for (; k < end && visits[k] % ITEM == number; ++k) {
+        const int32_t* block = tree.block_first + visits[k] / ITEM;
+        for (int64_t i = BLOCK * (int64_t)block[0]; i < BLOCK * (int64_t)block[1]; i += AT_ONCE) {
+            const double* pos = tree.block_pos + 3 * (i / BLOCK * BLOCK) + i % BLOCK;
+            const Axes gap = p - Axes{load<VN>(pos), load<VN>(pos + BLOCK), load<VN>(pos + 2 * BLOCK)};
+            best.take(dot(gap, gap), load<VN>(tree.block_number + i));
+        }
+    }
+    walks[number].vertices = best;
+    return k;
 }
 
 // Faces and vertices that may be the nearest of the points of a batch.
-void walk_together(const Tree& tree, Walk* walks, int32_t count) {
-    // Down to a leaf. What it holds, and what the leaves beside it hold, bounds the distance; a vertex is never nearer than the
-    // surface.
-    for (bool on = tree.num_nodes > 0; on;) {
-        on = false;
-        for (int32_t q = 0; q < count; ++q) {
-            if (walks[q].node < 0) continue;
-            go_down(tree, walks[q]);
-            on |= walks[q].node >= 0;
+void walk_together(const Tree& tree, const Levels& levels, Walk* walks, int32_t count) {
+    Visit *from = tree.visits, *to = tree.next_visits;
+    int64_t left = count, near = 0;
+    for (int32_t q = 0; q < count; ++q) from[q] = (Visit)q;
+    for (int level = levels.count - 1; level >= 0; --level) {
+        const float* boxes = tree.boxes + 6 * WIDE * levels.first[level];
+        int64_t listed = 0;
+        for (int64_t k = 0; k < left; ++k) {
+            const Walk& walk = walks[from[k] % ITEM];
+            const F8 away = boxes_dist_sq(boxes + from[k] / ITEM * (6 * WIDE), walk);
+            const Visit first = first_below(from[k]);
+            list_lanes(away <= walk.limit, first, to, listed);
+            if (!level) list_lanes(away <= walk.face_limit, first, tree.near, near);
         }
+        std::swap(from, to);
+        left = listed;
     }
-    int64_t nodes = 0, leaves = 0;
-    for (int32_t q = 0; q < count; ++q) {
-        Walk& walk = walks[q];
-        try_faces(tree, walk.p, -1 - walk.node, walk.faces);
-        try_vertices(tree, walk.p, -1 - walk.node, walk.vertices);
-        bound_vertices(walk);
+    for (int64_t k = 0; k < left;) k = try_vertices(tree, walks, from, k, left);
+    Visit pairs[MOST_PAIRS];
+    int64_t found = 0;
+    for (int64_t k = 0; k < near; ++k) {
+        const Visit visit = tree.near[k];
+        const Walk& walk = walks[visit % ITEM];
+        if ((int64_t)(visit / ITEM) == walk.leaf) continue;
+        list_lanes(boxes_dist_sq(tree.face_boxes + visit / ITEM * (6 * WIDE), walk) <= walk.face_limit, first_below(visit), pairs, found);
+        if (found > MOST_PAIRS - WIDE - AT_ONCE) try_pairs(tree, walks, pairs, found), found = 0;
     }
-    if (!tree.num_nodes) return;
-    for (int32_t q = 0; q < count; ++q) list_children(tree, walks[q], q, walks[q].parent, walks[q].node, nodes, leaves);
-    int64_t seen = 0;
-    for (; seen < leaves; ++seen) {
-        Walk& walk = walks[tree.leaves[seen].walk];
-        try_vertices(tree, walk.p, tree.leaves[seen].item, walk.vertices);
-    }
-    // Everything else within that bound.
-    for (int32_t q = 0; q < count; ++q) {
-        bound_vertices(walks[q]);
-        tree.nodes[nodes] = {q, 0};
-        nodes += walks[q].parent != 0;
-    }
-    for (int64_t i = 0; i < nodes; ++i) {
-        const Visit visit = tree.nodes[i];
-        list_children(tree, walks[visit.walk], visit.walk, visit.item, walks[visit.walk].parent, nodes, leaves);
-    }
-    for (; seen < leaves; ++seen) {
-        Walk& walk = walks[tree.leaves[seen].walk];
-        if (tree.reach[seen] > walk.limit) continue;
-        try_vertices(tree, walk.p, tree.leaves[seen].item, walk.vertices);
-        bound_vertices(walk);
-    }
-    for (int32_t q = 0; q < count; ++q) bound_faces(walks[q]);
-    for (int64_t i = 0; i < leaves; ++i) {
-        Walk& walk = walks[tree.leaves[i].walk];
-        if (tree.reach[i] > walk.limit || !may_hold(tree, walk, tree.leaves[i].item)) continue;
-        try_faces(tree, walk.p, tree.leaves[i].item, walk.faces);
-        bound_faces(walk);
-    }
+    try_pairs(tree, walks, pairs, found);
 }
 
 // Corners of the faces of a leaf among positions (W, 3).
@@ -577,99 +561,65 @@ void describe(const Tree& tree, const Query& query) {
     });
 }
 
-// Unit normals of the faces of a leaf; what is around all of them goes to the lane of its node.
-void fit_normals(const Tree& tree, int64_t leaf, double* side) {
-    double* normals = tree.leaf_normals + 3 * WIDE * leaf;
+// Unit normals of the faces of a leaf.
+void fit_normals(const Tree& tree, int64_t leaf) {
+    float* normals = tree.leaf_normals + 3 * WIDE * leaf;
     for (int i = 0; i < WIDE; i += AT_ONCE) {
         const double* table = tree.corners + 9 * WIDE * leaf + i;
         const Axes a = load_axes(table), u = load_axes(table + 3 * WIDE) - a, v = load_axes(table + 6 * WIDE) - a;
         Axes normal = everywhere({0.0, 0.0, 0.0});
         add_cross(u, v, normal);
         normal = unit(normal);
-        store(normals + i, normal.x), store(normals + WIDE + i, normal.y), store(normals + 2 * WIDE + i, normal.z);
-    }
-    for (int k = 0; k < 3; ++k) {
-        side[WIDE * k] = least_of([&](int i) { return load<VN>(normals + WIDE * k + i); });
-        side[WIDE * (3 + k)] = -least_of([&](int i) { return -load<VN>(normals + WIDE * k + i); });
+        store(normals + i, __builtin_convertvector(normal.x, FN)), store(normals + WIDE + i, __builtin_convertvector(normal.y, FN));
+        store(normals + 2 * WIDE + i, __builtin_convertvector(normal.z, FN));
     }
 }
 
-// Those of all faces, and boxes around them from the last node to the root; nothing to do where they are of this fit.
+// The least of eight numbers; passes over what is not a number.
+inline float least_of(const float* p) {
+    const F4 low = least(load<F4>(p), least(load<F4>(p + 4), F4{} + INFINITY));
+    return std::min(std::min(low[0], low[2]), std::min(low[1], low[3]));
+}
+inline float most_of(const float* p) {
+    const F4 high = greatest(load<F4>(p), greatest(load<F4>(p + 4), F4{} - INFINITY));
+    return std::max(std::max(high[0], high[2]), std::max(high[1], high[3]));
+}
+
+// Boxes of groups, from those of leaves up: those begin with ``low`` and ``high`` (3, 8), rows of so many numbers. Lanes without
+// anything in them are not a number.
+void fit_levels(int64_t num_leaves, const float* low, const float* high, int64_t row, float* boxes) {
+    const Levels levels(num_leaves);
+    int64_t size = num_leaves;
+    for (int level = 0; level < levels.count; ++level) {
+        float* into = boxes + 6 * WIDE * levels.first[level];
+        const int64_t next = levels.first[level + 1] - levels.first[level];
+        std::fill(into + 6 * WIDE * (next - 1), into + 6 * WIDE * next, NAN);
+        for (int64_t i = 0; i < size; ++i)
+            for (int k = 0; k < 3; ++k) {
+                float* side = into + WIDE * (6 * (i / WIDE) + k) + i % WIDE;
+                side[0] = least_of(low + row * i + WIDE * k), side[3 * WIDE] = most_of(high + row * i + WIDE * k);
+            }
+        low = into, high = into + 3 * WIDE, row = 6 * WIDE, size = next;
+    }
+}
+
+// Those of all faces, and boxes around them; nothing to do where they are of this fit.
 void fit_all_normals(Tree& tree) {
     if (tree.normals_of == tree.fits) return;
     tree.normals_of = tree.fits;
-    double nowhere[6 * WIDE];
-    if (!tree.num_nodes) fit_normals(tree, 0, nowhere);
-    for (int64_t node = tree.num_nodes - 1; node >= 0; --node)
-        for (int i = 0; i < WIDE; ++i) {
-            double* side = tree.normal_boxes + 6 * WIDE * node + i;
-            const int64_t child = tree.children[WIDE * node + i];
-            if (child < 0) {
-                fit_normals(tree, -1 - child, side);
-                continue;
-            }
-            for (int k = 0; k < 6; ++k) {
-                const double* below = tree.normal_boxes + WIDE * (6 * child + k);
-                side[WIDE * k] = child == node ? NAN
-                                 : k < 3       ? least_of([&](int j) { return load<VN>(below + j); })
-                                               : -least_of([&](int j) { return -load<VN>(below + j); });
-            }
-        }
+    for (int64_t leaf = 0; leaf < tree.num_leaves; ++leaf) fit_normals(tree, leaf);
+    fit_levels(tree.num_leaves, tree.leaf_normals, tree.leaf_normals, 3 * WIDE, tree.normal_boxes);
 }
 
-// Lanes whose least product of a normal with n is below a limit; none where there is no box.
-inline IN may_turn(const double* box, Vec n, double limit) {
-    const VN x = least(load<VN>(box) * n.x, load<VN>(box + 3 * WIDE) * n.x);
-    const VN y = least(load<VN>(box + WIDE) * n.y, load<VN>(box + 4 * WIDE) * n.y);
-    const VN z = least(load<VN>(box + 2 * WIDE) * n.z, load<VN>(box + 5 * WIDE) * n.z);
-    return x + y + z < limit;
-}
-
-// A bit for every one of eight lanes that is set, by parts that begin at a number.
-template <class Part> inline unsigned bits_of(const Part& part) {
-    alignas(64) int64_t lane[WIDE];
-    for (int i = 0; i < WIDE; i += AT_ONCE) store(lane + i, part(i));
-    unsigned bits = 0;
-    for (int i = 0; i < WIDE; ++i) bits |= (unsigned)(lane[i] != 0) << i;
-    return bits;
-}
-
-// Whether a face of a leaf that is turned by more than the cosine from n has its box within a distance of a point.
-bool leaf_turns(const Tree& tree, int64_t leaf, Vec p, float limit, Vec n, double cosine) {
-    const Vec local = p - at(tree.origin, 0);
-    const F8 away = box_dist_sq<F8>(tree.face_boxes + 6 * WIDE * leaf, (float)local.x, (float)local.y, (float)local.z);
-    alignas(32) float lane[WIDE];
-    store(lane, away);
-    const double* normals = tree.leaf_normals + 3 * WIDE * leaf;
-    unsigned turned = bits_of([&](int i) { return dot(load_axes(normals + i), everywhere(n)) < cosine; });
-    for (; turned; turned &= turned - 1)
-        if (lane[__builtin_ctz(turned)] <= limit) return true;
-    return false;
-}
-
-bool turns_near(const Tree& tree, Vec p, double dist_sq, Vec n, double cosine, std::vector<int64_t>& stack) {
-    const Vec local = p - at(tree.origin, 0);
-    const double size_sq = tree.size_sq + dot(local, local), limit = limit_of(dist_sq, size_sq);
-    const float face_limit = face_limit_of(dist_sq, size_sq);
-    if (!tree.num_nodes) return leaf_turns(tree, 0, p, face_limit, n, cosine);
-    for (stack.assign(1, 0); !stack.empty();) {
-        const int64_t node = stack.back();
-        stack.pop_back();
-        const double* normals = tree.normal_boxes + 6 * WIDE * node;
-        unsigned within = bits_of([&](int i) { return (children_dist_sq(tree, node, p, i) <= limit) & may_turn(normals + i, n, cosine); });
-        for (; within; within &= within - 1) {
-            const int64_t child = tree.children[WIDE * node + __builtin_ctz(within)];
-            if (child >= 0)
-                stack.push_back(child);
-            else if (leaf_turns(tree, -1 - child, p, face_limit, n, cosine))
-                return true;
-        }
-    }
-    return false;
+// The least product of a normal with n in every lane; not a number where there is no box.
+inline F8 least_turn(const float* box, Vec n) {
+    const float x = (float)n.x, y = (float)n.y, z = (float)n.z;
+    return least(load<F8>(box) * x, load<F8>(box + 3 * WIDE) * x) + least(load<F8>(box + WIDE) * y, load<F8>(box + 4 * WIDE) * y) +
+           least(load<F8>(box + 2 * WIDE) * z, load<F8>(box + 5 * WIDE) * z);
 }
 
 void finish(const Tree& tree, const Query& query, int64_t i, const Walk& walk) {
-    const Found closest = first_of(walk.faces), nearest = first_of(walk.vertices);
+    const Found closest = walk.face, nearest = first_of(walk.vertices);
     // A surface without a finite place has neither.
     const int64_t face = closest.number < NONE ? (int64_t)closest.number : tree.order[0];
     query.face[i] = face;
@@ -687,11 +637,43 @@ inline Vec ahead_of(const Matched& matched, const Query& query, int64_t i) {
     return at(query.points, i) + matched.ahead * at(matched.normal, i);
 }
 
-// Whether a face ahead of a point that is turned may be nearer than the skin that it was matched with.
-bool may_fold(const Tree& tree, const Matched& matched, const Query& query, int64_t i, std::vector<int64_t>& stack) {
-    if (!matched.valid[i] || !(std::fabs(matched.dist[i]) < matched.near)) return false;
-    const Vec place = ahead_of(matched, query, i), own = place - at(matched.point, i);
-    return turns_near(tree, place, dot(own, own), at(matched.normal, i), matched.cosine, stack);
+// Which points from ``begin`` on, no more than a batch, may be nearer to a face that is turned than to the skin that they were matched
+// with, from a place ahead of them.
+void find_turned(const Tree& tree, const Levels& levels, const Matched& matched, const Query& query, int64_t begin, int64_t end, uint8_t* found) {
+    Walk walks[MOST];
+    Visit *from = tree.visits, *to = tree.next_visits;
+    int64_t left = 0;
+    for (int64_t i = begin; i < end; ++i) {
+        found[i] = 0;
+        if (!matched.valid[i] || !(std::fabs(matched.dist[i]) < matched.near)) continue;
+        Walk& walk = walks[i - begin];
+        const Vec place = ahead_of(matched, query, i), own = place - at(matched.point, i), local = place - at(tree.origin, 0);
+        place_walk(tree, walk, place);
+        walk.limit = limit_of(dot(own, own), tree.size_sq + dot(local, local));
+        from[left++] = (Visit)(i - begin);
+    }
+    // Faces that are turned by a little less are no harm: what is found is looked at again.
+    const float cosine = (float)matched.cosine + 1e-5f;
+    for (int level = levels.count - 1; level >= 0; --level) {
+        int64_t listed = 0;
+        for (int64_t k = 0; k < left; ++k) {
+            const int64_t group = levels.first[level] + (int64_t)(from[k] / ITEM), q = (int64_t)(from[k] % ITEM);
+            const F8 turn = least_turn(tree.normal_boxes + 6 * WIDE * group, at(matched.normal, begin + q));
+            list_lanes((boxes_dist_sq(tree.boxes + 6 * WIDE * group, walks[q]) <= walks[q].limit) & (turn < cosine), first_below(from[k]), to, listed);
+        }
+        std::swap(from, to);
+        left = listed;
+    }
+    for (int64_t k = 0; k < left; ++k) {
+        const int64_t leaf = (int64_t)(from[k] / ITEM), q = (int64_t)(from[k] % ITEM);
+        const Vec n = at(matched.normal, begin + q);
+        const float* normals = tree.leaf_normals + 3 * WIDE * leaf;
+        const F8 turn = load<F8>(normals) * (float)n.x + load<F8>(normals + WIDE) * (float)n.y + load<F8>(normals + 2 * WIDE) * (float)n.z;
+        Visit some[WIDE + 1];
+        int64_t faces = 0;
+        list_lanes((boxes_dist_sq(tree.face_boxes + 6 * WIDE * leaf, walks[q]) <= walks[q].limit) & (turn < cosine), 0, some, faces);
+        found[begin + q] |= faces > 0;
+    }
 }
 
 // Whether what was found k-th is another side than that of the i-th point. Of a sharp edge only the faces are turned, of a bulge
@@ -705,48 +687,32 @@ bool is_other(const Tree& tree, const Matched& matched, const Query& found, int6
     return turned && in_front && std::fabs(found.dist[k]) <= matched.ahead + matched.near;
 }
 
+// Work on the points of a part, batch by batch, with lists of its own.
+template <class Work> void for_batches(Tree tree, int64_t count, int64_t part, const Work& work) {
+    for (Visit** list : {&tree.visits, &tree.next_visits, &tree.near}) *list += (tree.batch * tree.num_leaves + WIDE) * part;
+    const Range range = range_of(count, part, tree.parts, tree.batch);
+    for (int64_t i = range.begin; i < range.end; i += tree.batch) work(tree, i, std::min(i + tree.batch, range.end));
+}
+
 void search(const Tree& tree, const Query& query, int64_t begin, int64_t end) {
+    const Levels levels(tree.num_leaves);
     Walk walks[MOST];
     bool finite[MOST];
     for (int64_t i = begin; i < end; ++i) {
+        Walk& walk = walks[i - begin];
         const Vec p = at(query.points, i);
         finite[i - begin] = std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z);
-        walk_from(walks[i - begin], tree, finite[i - begin] ? p : Vec{0.0, 0.0, 0.0});
-        if (!query.hint || !finite[i - begin]) continue;
-        const Vec gap = p - at(tree.pos, query.hint[i]);
-        if (dot(gap, gap) >= 0.0) walks[i - begin].known_sq = dot(gap, gap);
+        place_walk(tree, walk, finite[i - begin] ? p : Vec{0.0, 0.0, 0.0});
+        walk.leaf = query.hint ? tree.place[query.hint[i]] / WIDE : likely_leaf(tree, levels, walk);
+        for (int k = 0; k < 9; ++k) __builtin_prefetch(tree.corners + WIDE * (9 * walk.leaf + k));
+        __builtin_prefetch(tree.number + WIDE * walk.leaf);
     }
-    walk_together(tree, walks, (int32_t)(end - begin));
+    for (int64_t i = begin; i < end; ++i) begin_at(tree, walks[i - begin], walks[i - begin].leaf);
+    walk_together(tree, levels, walks, (int32_t)(end - begin));
     for (int64_t i = begin; i < end; ++i) {
         finish(tree, query, i, walks[i - begin]);
         if (!finite[i - begin]) query.dist[i] = NAN;
     }
-}
-
-// Halves the faces ``begin`` to ``end`` of the order, into whole leaves as far as they go; returns the middle.
-int32_t halve_leaves(Tree& tree, int32_t begin, int32_t end, const double* centre) {
-    if (end - begin <= WIDE) return end;
-    const int32_t middle = begin + WIDE * (((end - begin) / 2 + WIDE - 1) / WIDE);
-    halve(tree.order, begin, middle, end, centre);
-    return middle;
-}
-
-// The node, or -1 - leaf, of the faces ``begin`` to ``end`` of the order.
-int32_t grow(Tree& tree, int32_t begin, int32_t end, const double* centre) {
-    if (end - begin <= WIDE) {
-        ++tree.num_leaves;
-        return -1 - begin / WIDE;
-    }
-    const int32_t node = (int32_t)tree.num_nodes++;
-    int32_t cut[WIDE + 1];
-    cut[0] = begin, cut[WIDE] = end;
-    for (int step = WIDE; step > 1; step /= 2)
-        for (int i = 0; i < WIDE; i += step) cut[i + step / 2] = halve_leaves(tree, cut[i], cut[i + step], centre);
-    for (int i = 0; i < WIDE; ++i) {
-        const int32_t child = cut[i] < cut[i + 1] ? grow(tree, cut[i], cut[i + 1], centre) : node;
-        tree.children[WIDE * (int64_t)node + i] = child;
-    }
-    return node;
 }
 
 // Gives every vertex to one of the leaves around it, to that which has the fewest, and lists those of each leaf.
@@ -763,16 +729,16 @@ void share_vertices(Tree& tree) {
         if (owner >= 0) ++count[owner];
     }
     tree.block_first[0] = 0;
-    for (int64_t leaf = 0; leaf < tree.num_leaves; ++leaf) count[leaf] = tree.block_first[leaf] + (count[leaf] + WIDE - 1) / WIDE;
+    for (int64_t leaf = 0; leaf < tree.num_leaves; ++leaf) count[leaf] = tree.block_first[leaf] + (count[leaf] + BLOCK - 1) / BLOCK;
     tree.num_blocks = tree.block_first[tree.num_leaves];
-    std::fill(tree.block_vertex, tree.block_vertex + WIDE * tree.num_blocks, -1);
+    std::fill(tree.block_vertex, tree.block_vertex + BLOCK * tree.num_blocks, -1);
     for (int64_t vertex = 0; vertex < tree.num_vertices; ++vertex) {
         if (tree.stamp[vertex] < 0) continue;
-        int32_t* slot = tree.block_vertex + WIDE * (int64_t)tree.block_first[tree.stamp[vertex]];
+        int32_t* slot = tree.block_vertex + BLOCK * (int64_t)tree.block_first[tree.stamp[vertex]];
         while (*slot >= 0) ++slot;
         *slot = (int32_t)vertex;
     }
-    for (int64_t i = 0; i < WIDE * tree.num_blocks; ++i)
+    for (int64_t i = 0; i < BLOCK * tree.num_blocks; ++i)
         if (tree.block_vertex[i] < 0) tree.block_vertex[i] = tree.block_vertex[i - 1];
 }
 
@@ -822,47 +788,25 @@ void locate(Tree& tree) {
     for (int k = 0; k < 3; ++k) {
         VN low = every(INFINITY), high = every(-INFINITY);
         for (int64_t block = 0; block < tree.num_blocks; ++block)
-            for (int i = 0; i < WIDE; i += AT_ONCE) widen(load<VN>(tree.block_pos + WIDE * (3 * block + k) + i), low, high);
+            for (int i = 0; i < BLOCK; i += AT_ONCE) widen(load<VN>(tree.block_pos + BLOCK * (3 * block + k) + i), low, high);
         const double begin = least_lane(low), end = -least_lane(-high), middle = 0.5 * (begin + end);
         tree.origin[k] = std::isfinite(middle) ? middle : 0.0;
         tree.size_sq += (end - begin) * (end - begin);
     }
 }
 
-// Boxes of the faces of a leaf; what is around all of them goes to the lane of its node.
-inline void fit_leaf(Tree& tree, int64_t leaf, double* side) {
-    for (int k = 0; k < 3; ++k) {
-        VN low = every(INFINITY), high = every(-INFINITY);
-        for (int i = 0; i < WIDE; i += AT_ONCE) {
-            VN lowest = every(INFINITY), highest = every(-INFINITY);
-            for (int c = 0; c < 3; ++c) widen(load<VN>(tree.corners + WIDE * (9 * leaf + 3 * c + k) + i), lowest, highest);
-            float* box = tree.face_boxes + WIDE * (6 * leaf + k) + i;
-            store(box, __builtin_convertvector(lowest - tree.origin[k], FN));
-            store(box + 3 * WIDE, __builtin_convertvector(highest - tree.origin[k], FN));
-            low = least(lowest, low), high = greatest(highest, high);
-        }
-        side[WIDE * k] = least_lane(low), side[WIDE * (3 + k)] = -least_lane(-high);
-    }
-}
-
-// Boxes of nodes, from the last one to the root: children come after their node.
+// Boxes of the faces, and of groups.
 void fit_boxes(Tree& tree) {
-    for (int64_t node = tree.num_nodes - 1; node >= 0; --node)
-        for (int i = 0; i < WIDE; ++i) {
-            double* side = tree.boxes + 6 * WIDE * node + i;
-            const int64_t child = tree.children[WIDE * node + i];
-            if (child < 0) {
-                fit_leaf(tree, -1 - child, side);
-                continue;
-            }
-            for (int k = 0; k < 3; ++k) {
+    for (int64_t leaf = 0; leaf < tree.num_leaves; ++leaf)
+        for (int k = 0; k < 3; ++k)
+            for (int i = 0; i < WIDE; i += AT_ONCE) {
                 VN low = every(INFINITY), high = every(-INFINITY);
-                for (int c = 0; c < 2; ++c)
-                    for (int j = 0; j < WIDE; j += AT_ONCE) widen(load<VN>(tree.boxes + WIDE * (6 * child + 3 * c + k) + j), low, high);
-                side[WIDE * k] = child == node ? NAN : least_lane(low);
-                side[WIDE * (3 + k)] = child == node ? NAN : -least_lane(-high);
+                for (int c = 0; c < 3; ++c) widen(load<VN>(tree.corners + WIDE * (9 * leaf + 3 * c + k) + i), low, high);
+                float* box = tree.face_boxes + WIDE * (6 * leaf + k) + i;
+                store(box, __builtin_convertvector(low - tree.origin[k], FN));
+                store(box + 3 * WIDE, __builtin_convertvector(high - tree.origin[k], FN));
             }
-        }
+    fit_levels(tree.num_leaves, tree.face_boxes, tree.face_boxes + 3 * WIDE, 6 * WIDE, tree.boxes);
 }
 
 // The turn [rad] that takes points nearest to others about their middle, from sums Σ s eᵀ (3, 3): Horn's matrix, whose eigenvector
@@ -927,8 +871,8 @@ void surface_moved(int64_t count, const double* start, const double* end, double
 
 // Everything that depends on the topology alone, from centres (G, 3) of the faces; ``order`` holds those in the tree.
 void surface_build(Tree* tree, const double* centre) {
-    tree->num_nodes = tree->num_leaves = tree->num_blocks = 0;
-    grow(*tree, 0, (int32_t)tree->num_faces, centre);
+    tree->num_leaves = (tree->num_faces + WIDE - 1) / WIDE;
+    order_leaves(tree->order, (int32_t)tree->num_faces, WIDE, centre);
     for (int64_t i = tree->num_faces; i < WIDE * tree->num_leaves; ++i) tree->order[i] = tree->order[tree->num_faces - 1];
     for (int64_t i = 0; i < WIDE * tree->num_leaves; ++i) {
         tree->number[i] = tree->order[i];
@@ -940,16 +884,16 @@ void surface_build(Tree* tree, const double* centre) {
     std::fill(tree->stamp, tree->stamp + tree->num_vertices, 0);
     std::vector<std::array<int32_t, 2>> left;
     for (int64_t vertex = 0; vertex < tree->num_vertices; ++vertex) list_fan(*tree, vertex, left);
-    for (int64_t i = 0; i < WIDE * tree->num_blocks; ++i) tree->block_number[i] = tree->block_vertex[i];
+    for (int64_t i = 0; i < BLOCK * tree->num_blocks; ++i) tree->block_number[i] = tree->block_vertex[i];
 }
 
 // Takes up where the vertices are now.
 void surface_refit(Tree* tree) {
     ++tree->call, ++tree->fits;
     for (int64_t leaf = 0; leaf < tree->num_leaves; ++leaf) fill_corners(*tree, leaf, tree->pos, tree->corners + 9 * WIDE * leaf);
-    for (int64_t i = 0; i < WIDE * tree->num_blocks; ++i)
+    for (int64_t i = 0; i < BLOCK * tree->num_blocks; ++i)
         for (int k = 0; k < 3; ++k)
-            tree->block_pos[3 * WIDE * (i / WIDE) + WIDE * k + i % WIDE] = tree->pos[3 * (int64_t)tree->block_vertex[i] + k];
+            tree->block_pos[3 * BLOCK * (i / BLOCK) + BLOCK * k + i % BLOCK] = tree->pos[3 * (int64_t)tree->block_vertex[i] + k];
     locate(*tree);
     fit_boxes(*tree);
 }
@@ -997,11 +941,7 @@ void surface_curvature(int64_t num_faces, int64_t num_edges, int64_t num_vertice
 // The faces nearest to the points, where on them, and how far away.
 void surface_find(const Tree* tree, const Query* query) {
     for_parts(tree->parts, [&](int64_t part) {
-        Tree own = *tree;
-        const int64_t visits = own.batch * own.num_leaves + 1;
-        own.nodes += visits * part, own.leaves += visits * part, own.reach += visits * part;
-        const Range range = range_of(query->count, part, own.parts, own.batch);
-        for (int64_t i = range.begin; i < range.end; i += own.batch) search(own, *query, i, std::min(i + own.batch, range.end));
+        for_batches(*tree, query->count, part, [&](const Tree& own, int64_t begin, int64_t end) { search(own, *query, begin, end); });
     });
 }
 
@@ -1013,9 +953,8 @@ void surface_describe(const Tree* tree, const Query* query) { describe(*tree, *q
 void surface_folds(Tree* tree, const Matched* matched, const Query* all, uint8_t* found) {
     fit_all_normals(*tree);
     for_parts(tree->parts, [&](int64_t part) {
-        std::vector<int64_t> stack;
-        const Range range = range_of(all->count, part, tree->parts);
-        for (int64_t i = range.begin; i < range.end; ++i) found[i] = may_fold(*tree, *matched, *all, i, stack);
+        const Levels levels(tree->num_leaves);
+        for_batches(*tree, all->count, part, [&](const Tree& own, int64_t begin, int64_t end) { find_turned(own, levels, *matched, *all, begin, end, found); });
     });
     std::vector<int64_t> rows;
     for (int64_t i = 0; i < all->count; ++i)

@@ -36,18 +36,18 @@ class _Tree(ctypes.Structure):
     """``Tree`` of ``surface.cpp``."""
 
     _fields_ = [
-        *fields("num_faces num_vertices num_nodes num_leaves num_blocks edge_width", COUNT),
+        *fields("num_faces num_vertices num_leaves num_blocks edge_width", COUNT),
         *fields("faces around first valence face_edges edge_faces", POINTER),
-        *fields("order place children number corner_of block_first block_vertex block_number", POINTER),
+        *fields("order place number corner_of block_first block_vertex block_number", POINTER),
         *fields("fan_first fan fan_share", POINTER),
-        *fields("pos corners boxes face_boxes block_pos vertex_normal bulge needed stamp", POINTER),
+        *fields("pos corners face_boxes boxes block_pos vertex_normal bulge needed stamp", POINTER),
         ("call", COUNT),
         ("origin", ctypes.c_double * 3),
         ("size_sq", ctypes.c_double),
         *fields("batch parts", COUNT),
         *fields("leaf_normals normal_boxes", POINTER),
         *fields("normals_of fits", COUNT),
-        *fields("nodes leaves reach", POINTER),
+        *fields("visits next_visits near", POINTER),
     ]
 
 
@@ -124,11 +124,11 @@ class SurfaceTree:
         self._lib = lib
         leaves, num_vertices = -(-len(members) // _WIDE), len(pos)  # all leaves are full but one
         blocks = 3 * leaves  # at most: faces without a vertex in common
+        groups = (leaves // 7 + 12, 6, _WIDE)  # an eighth, an eighth of that and so on, each rounded up
         batch = max(min(_MOST, _VISITS // leaves), 1)
         integers = {
             "order": (leaves, _WIDE),
             "place": (len(faces),),
-            "children": (leaves, _WIDE),
             "corner_of": (leaves, 3, _WIDE),
             "block_first": (leaves + 1,),
             "block_vertex": (blocks, _WIDE),
@@ -143,29 +143,27 @@ class SurfaceTree:
             "fan_share": (9 * len(faces),),
             "pos": (num_vertices, 3),
             "corners": (leaves, 9, _WIDE),
-            "boxes": (leaves, 6, _WIDE),
             "block_pos": (blocks, 3, _WIDE),
             "vertex_normal": (num_vertices, 6),
             "bulge": (2, num_vertices),
-            "leaf_normals": (leaves, 3, _WIDE),
-            "normal_boxes": (leaves, 6, _WIDE),
         }
         self._arrays = dict(zip(("around", "first", "valence", "face_edges", "edge_faces"), incidence, strict=True))
         self._arrays |= {name: _aligned(shape, np.int32) for name, shape in integers.items()}
         self._arrays |= {name: _aligned(shape, np.float64) for name, shape in reals.items()}
-        self._arrays |= {"face_boxes": _aligned((leaves, 6, _WIDE), np.float32)}
+        boxes = {"face_boxes": (leaves, 6, _WIDE), "boxes": groups, "leaf_normals": (leaves, 3, _WIDE), "normal_boxes": groups}
+        self._arrays |= {name: _aligned(shape, np.float32) for name, shape in boxes.items()}
         self._arrays["faces"] = np.ascontiguousarray(faces, np.int64)
         self._arrays["order"].reshape(-1)[: len(members)] = members
         self._arrays["place"].fill(-1)
         counts = {"num_faces": len(members), "num_vertices": num_vertices, "edge_width": incidence[4].shape[1]}
         self._tree = _Tree(**counts, batch=batch)
         _point(self._tree, self._arrays)
-        self._visits = batch * leaves + 1
+        self._visits = batch * leaves + _WIDE
         self._share(1)
         centre = np.ascontiguousarray(np.nan_to_num(np.asarray(pos, np.float64)[faces].mean(axis=1)))
         self._fitted: tuple[weakref.ref[Tensor], int | None] | None = None
         self._last: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # points, and where they are, of the last search
-        self._near: dict[int, np.ndarray] = {}  # vertices (N,) that the last search for N points found
+        self._near: dict[int, np.ndarray] = {}  # faces (N,) that the last search for N points found
         lib.surface_build(ctypes.byref(self._tree), centre.ctypes.data_as(POINTER))
 
     def forget(self) -> None:
@@ -176,8 +174,7 @@ class SurfaceTree:
     def _share(self, parts: int) -> None:
         """Search for points in as many parts, by threads of their own; what is found does not depend on it."""
         if parts > self._tree.parts:
-            visits = {name: _aligned((parts, self._visits, 2), np.int32) for name in ("nodes", "leaves")}
-            visits["reach"] = _aligned((parts, self._visits), np.float64)
+            visits = {name: _aligned((parts, self._visits), np.int64) for name in ("visits", "next_visits", "near")}
             self._arrays |= visits
             _point(self._tree, visits)
         self._tree.parts = parts
@@ -228,7 +225,7 @@ class SurfaceTree:
             self._lib.surface_find(ctypes.byref(self._tree), ctypes.byref(query))
             self._last = points.copy(), found
             if count >= _REMEMBERED:
-                self._near[count] = found["vertex"]
+                self._near[count] = found["face"]
                 if len(self._near) > _SIZES:
                     del self._near[next(iter(self._near))]
         return self._last[1]

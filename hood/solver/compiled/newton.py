@@ -187,7 +187,7 @@ class CompiledStep:
 
     def of(self, vertex: np.ndarray) -> dict[str, np.ndarray]:
         """What vertices (N,) have, in their order: loops over them then read it in one go."""
-        return {name: getattr(self, name)[vertex] for name in ("base", "fixed", "inertia", "weight")}
+        return {name: np.take(getattr(self, name), vertex, axis=0) for name in ("base", "fixed", "inertia", "weight")}
 
     def contact_of(self, vertex: np.ndarray) -> tuple[tuple[Walls, ...], tuple[Grip, ...]]:
         """Walls and grips of vertices (N,), in their order."""

@@ -93,7 +93,7 @@ def test_what_was_near_before_changes_nothing_but_the_visits():
         moved, there = pos * (1 + 0.3 * step) + 0.1 * step * pos.flip(1), where.roll(step, 1) + 0.2 * step
         moved[step], there[2 * step] = torch.nan, torch.nan
         if step % 2:
-            tree._near[300] = generator.integers(0, len(pos), 300)
+            tree._near[300] = generator.integers(0, len(faces), 300)
         assert len(tree._near[300]) == 300
         known = found(there, moved, faces)
         surface_tree.forget_searches()
@@ -111,9 +111,11 @@ def test_a_far_search_visits_less_after_one_like_it():
     where = np.ascontiguousarray(40.0 * points(400).numpy())
     visits = []
     for _ in range(2):
-        tree._arrays["reach"].fill(np.nan)
+        lists = [tree._arrays[name] for name in ("visits", "next_visits")]
+        for visited in lists:
+            visited.fill(-1)
         tree.search(where, pos, pos.numpy(), False)
-        visits.append(int(np.isfinite(tree._arrays["reach"]).sum()))
+        visits.append(sum(int((visited >= 0).sum()) for visited in lists))
     assert visits[1] < visits[0]
 
 
@@ -132,6 +134,14 @@ def test_nearest_vertices_are_those_of_all():
     dist = (where[:, None] - pos[None]).norm(dim=2)
     hit = found(where, pos, faces)
     torch.testing.assert_close(hit.vertex_dist, dist.min(dim=1).values, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e39])
+def test_places_that_boxes_in_float32_do_not_hold(size):
+    pos, faces = surface()
+    where, pos = 1e39 * points(50), size * pos
+    dist = (where[:, None] - pos[None]).norm(dim=2)
+    torch.testing.assert_close(found(where, pos, faces).vertex_dist, dist.min(dim=1).values, rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 63, 64, 65, 200])
