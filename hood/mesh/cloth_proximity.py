@@ -67,8 +67,9 @@ def library() -> ctypes.CDLL:
         getattr(lib, name).argtypes = [POINTER, POINTER, POINTER, REAL]
     lib.layers_restart.argtypes = [POINTER]
     lib.layers_apart.argtypes = [POINTER, POINTER, REAL]
-    for name in ("layers_crossed", "layers_apart", "layers_approach", "layers_follow", "layers_model", "layers_fixed_are_free"):
-        getattr(lib, name).restype = COUNT
+    lib.layers_free_way.argtypes = [*[POINTER] * 3, REAL, REAL]
+    for name in ("crossed", "apart", "free_way", "approach", "follow", "model", "fixed_are_free"):
+        getattr(lib, f"layers_{name}").restype = COUNT
     for name in ("layers_limit", "layers_energy"):
         getattr(lib, name).restype = REAL
     for name, count in (("energy", 2), ("model", 2), ("contacts", 5), ("forces", 3), ("rows", 2), ("counts", 3)):
@@ -270,11 +271,21 @@ class ClothSurface:
         self._found = None
         self._lib.layers_restart(self.handle)
 
-    def remember_apart(self, pos: np.ndarray) -> None:
-        """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``."""
+    def remember_apart(self, pos: np.ndarray, known: bool = False) -> None:
+        """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``, or that is known."""
         here = _positions(pos)
-        if self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
+        if known or self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
             self.mesh.apart = _Apart(here.copy(), self._held, self.between)
+
+    def free_way(self, now: np.ndarray, there: np.ndarray) -> tuple[bool, bool]:
+        """Whether no two features meet on the straight ways from ``now`` to ``there`` (V, 3), nor are within their reach at
+        their ends, and whether :data:`SPARE` is left there as well. Where not, :meth:`restart`.
+
+        Asked first where nothing is near anything, it is a search of these ways alone, without margins: half the time.
+        """
+        now, there = _positions(now), _positions(there)
+        answer = int(self._lib.layers_free_way(self.handle, now.ctypes.data, there.ctypes.data, LEFT, SPARE))
+        return answer > 0, answer > 1
 
     def approach(self, target: np.ndarray) -> np.ndarray:
         """Positions (V, 3) near ``target`` (V, 3) that straight ways from the start lead to on which no two features meet.

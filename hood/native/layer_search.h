@@ -72,6 +72,13 @@ struct LayerMesh {
 
 constexpr int64_t LEAF = 4;  // faces
 
+// Halves differ by a face at most, so that the levels above the last are full.
+inline int64_t num_nodes(int64_t num_faces) {
+    int64_t size = 1;
+    for (int64_t most = num_faces; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
+    return size;
+}
+
 // Whether the tree halves the first of two ranges of faces, one of which is no leaf, or the other one.
 inline bool halves_first(int64_t count, int64_t other) { return other <= LEAF || (count > LEAF && count >= other); }
 
@@ -126,37 +133,76 @@ struct Candidate {
 // What the search knows of the faces whatever their positions are: boxes of most pairs of faces that overlap belong to faces with a
 // common vertex, of which the features that may be near each other are always the same. All by places in the order.
 struct LayerTopology {
+    typedef std::pair<uint64_t, std::array<int32_t, 2>> Ranked;  // two faces and their rank
+    // Two nodes, -1 without any, whose faces have no such vertex in common, after so many pairs of faces.
+    struct Step {
+        int32_t a, b, after;
+    };
+
     OwnFeatures vertices, edges;
     std::vector<std::array<int32_t, 3>> corners;  // (F)
-    std::vector<std::array<int32_t, 3>> links;    // (F) the same; vertices of more than MOST_AROUND faces are negative, no two alike
     // Of faces with a common vertex of few faces, as the tree visits them: pairs of features without one, by the places of their boxes.
     std::vector<Candidate> beside[2];
     std::vector<std::array<int32_t, 2>> boxes[2];
+    int64_t num_beside = 0;  // pairs of such faces
+    // Nodes that hold such faces always overlap: what the tree comes to by them, in its order. Pairs of faces without such a vertex
+    // in leaves that hold others with one, and pairs of nodes.
+    std::vector<std::array<int32_t, 2>> faces, span;  // and the faces of a node
+    std::vector<Step> steps;
 
     static constexpr size_t MOST_AROUND = 64;  // pairs of faces at a vertex are as many as its square
+    static constexpr int64_t SHARES = 32;      // two nodes of a step have at most this share of all faces, for threads
 
-    explicit LayerTopology(const LayerMesh& mesh) : corners(mesh.num_faces), links(mesh.num_faces) {
+    explicit LayerTopology(const LayerMesh& mesh) : corners(mesh.num_faces) {
         vertices.list(mesh.face_vertex, mesh.order, mesh.num_faces), edges.list(mesh.face_edge, mesh.order, mesh.num_faces);
         std::vector<std::vector<int32_t>> around(mesh.num_vertices);
         for (int64_t i = 0; i < mesh.num_faces; ++i)
             for (int c = 0; c < 3; ++c) around[corners[i][c] = mesh.faces[3 * (int64_t)mesh.order[i] + c]].push_back((int32_t)i);
-        std::vector<std::pair<uint64_t, std::array<int32_t, 2>>> both;
+        std::vector<Ranked> both;
         for (int64_t i = 0; i < mesh.num_faces; ++i)
-            for (int c = 0; c < 3; ++c) links[i][c] = around[corners[i][c]].size() > MOST_AROUND ? (int32_t)(-3 * i - c - 1) : corners[i][c];
-        for (int64_t i = 0; i < mesh.num_faces; ++i)
-            for (int32_t v : links[i])
-                for (size_t k = 0; v >= 0 && k < around[v].size(); ++k)
+            for (int32_t v : corners[i])
+                for (size_t k = 0; around[v].size() <= MOST_AROUND && k < around[v].size(); ++k)
                     if (const int32_t j = around[v][k]; i < j) both.push_back({rank_of(mesh.num_faces, i, j), {(int32_t)i, j}});
         std::sort(both.begin(), both.end());
         both.erase(std::unique(both.begin(), both.end()), both.end());
+        num_beside = (int64_t)both.size();
         for (const auto& [rank, faces] : both) list(mesh, faces[0], faces[1]);
+        span.resize(num_nodes(mesh.num_faces));
+        if (mesh.num_faces) spread(0, 0, (int32_t)mesh.num_faces);
+        const Ranked* next = both.data();
+        if (mesh.num_faces) step_within(0, next, next + both.size());
+        steps.push_back({-1, -1, (int32_t)faces.size()});
     }
 
-    // Whether two faces have such a vertex in common.
-    bool meet(int64_t i, int64_t j) const {
-        const std::array<int32_t, 3>&a = links[i], &b = links[j];
-        return (a[0] == b[0]) | (a[0] == b[1]) | (a[0] == b[2]) | (a[1] == b[0]) | (a[1] == b[1]) | (a[1] == b[2]) | (a[2] == b[0]) |
-               (a[2] == b[1]) | (a[2] == b[2]);
+    void spread(int32_t at, int32_t begin, int32_t end) {
+        span[at] = {begin, end};
+        if (end - begin <= LEAF) return;
+        spread(2 * at + 1, begin, (begin + end) / 2), spread(2 * at + 2, (begin + end) / 2, end);
+    }
+
+    int64_t size(int32_t at) const { return span[at][1] - span[at][0]; }
+
+    // The steps within a node, or between two; ``next`` are faces with a common vertex that are still to come.
+    void step_within(int32_t at, const Ranked*& next, const Ranked* last) {
+        if (size(at) <= LEAF) return step_leaves(at, at, next, last);
+        step_within(2 * at + 1, next, last), step_within(2 * at + 2, next, last);
+        step_between(2 * at + 1, 2 * at + 2, next, last);
+    }
+
+    void step_between(int32_t a, int32_t b, const Ranked*& next, const Ranked* last) {
+        const auto in = [&](int32_t face, int32_t at) { return face >= span[at][0] && face < span[at][1]; };
+        const bool beside = next < last && in(next->second[0], a) && in(next->second[1], b), leaves = size(a) <= LEAF && size(b) <= LEAF;
+        if (!beside && (leaves || SHARES * (size(a) + size(b)) <= size(0))) return steps.push_back({a, b, (int32_t)faces.size()});
+        if (leaves) return step_leaves(a, b, next, last);
+        if (halves_first(size(a), size(b))) return step_between(2 * a + 1, b, next, last), step_between(2 * a + 2, b, next, last);
+        step_between(a, 2 * b + 1, next, last), step_between(a, 2 * b + 2, next, last);
+    }
+
+    void step_leaves(int32_t a, int32_t b, const Ranked*& next, const Ranked* last) {
+        for (int32_t i = span[a][0]; i < span[a][1]; ++i)
+            for (int32_t j = a == b ? i + 1 : span[b][0]; j < span[b][1]; ++j)
+                if (const std::array<int32_t, 2> pair = {i, j}; next < last && next->second == pair) ++next;
+                else faces.push_back(pair);
     }
 
     bool holds(int64_t face, int32_t v) const { return (v == corners[face][0]) | (v == corners[face][1]) | (v == corners[face][2]); }
@@ -231,9 +277,7 @@ struct LayerTree {
                 join(face[i], vertex[corner[1]]), join(face[i], vertex[corner[2]]);
             }
         });
-        int64_t size = 1;  // halves differ by a face at most, so that the levels above the last are full
-        for (int64_t most = num_faces; most > LEAF; most = (most + 1) / 2) size = 2 * size + 1;
-        node.resize(size);
+        node.resize(num_nodes(num_faces));
         if (num_faces) refit(0, 0, num_faces);
     }
 
@@ -251,55 +295,17 @@ struct LayerTree {
         join(node[at], node[2 * at + 2]);
     }
 
-    // A piece of the search: pairs within a node, or between two.
-    struct Piece {
-        int64_t a, a0, a1, b, b0, b1;  // b -1: within a
-    };
-
-    // The search for pairs of faces whose boxes overlap, in pieces of at most so many faces and in their order.
-    std::vector<Piece> pieces(int64_t most) const {
-        std::vector<Piece> found;
-        if (num_faces > 1) halve({0, 0, num_faces, -1, 0, 0}, most, found);
-        return found;
-    }
-
-    void halve(const Piece& piece, int64_t most, std::vector<Piece>& found) const {
-        const auto [a, a0, a1, b, b0, b1] = piece;
-        if (a1 - a0 + b1 - b0 <= std::max(most, 2 * LEAF)) {
-            found.push_back(piece);
-        } else if (const int64_t middle = (a0 + a1) / 2; b < 0) {
-            halve({2 * a + 1, a0, middle, -1, 0, 0}, most, found);
-            halve({2 * a + 2, middle, a1, -1, 0, 0}, most, found);
-            halve({2 * a + 1, a0, middle, 2 * a + 2, middle, a1}, most, found);
-        } else if (!overlap(node[a], node[b])) {
-            return;
-        } else if (halves_first(a1 - a0, b1 - b0)) {
-            halve({2 * a + 1, a0, middle, b, b0, b1}, most, found);
-            halve({2 * a + 2, middle, a1, b, b0, b1}, most, found);
-        } else {
-            const int64_t half = (b0 + b1) / 2;
-            halve({a, a0, a1, 2 * b + 1, b0, half}, most, found);
-            halve({a, a0, a1, 2 * b + 2, half, b1}, most, found);
+    // visit(i, j) for pairs of faces whose boxes overlap, without a common vertex of few faces: of some steps, in their order.
+    template <class Visit> void pairs(const LayerTopology& topology, Range steps, const Visit& visit) const {
+        int32_t k = steps.begin ? topology.steps[steps.begin - 1].after : 0;
+        for (int64_t i = steps.begin; i < steps.end; ++i) {
+            const LayerTopology::Step step = topology.steps[i];
+            for (; k < step.after; ++k)
+                if (const auto [one, other] = topology.faces[k]; overlap(face[one], face[other])) visit(one, other);
+            if (step.a < 0 || !overlap(node[step.a], node[step.b])) continue;
+            const std::array<int32_t, 2>&a = topology.span[step.a], &b = topology.span[step.b];
+            between(step.a, a[0], a[1], step.b, b[0], b[1], visit);
         }
-    }
-
-    // visit(i, j) for pairs of faces whose boxes overlap, of a piece.
-    template <class Visit> void pairs(const Piece& piece, const Visit& visit) const {
-        if (piece.b < 0) within(piece.a, piece.a0, piece.a1, visit);
-        else between(piece.a, piece.a0, piece.a1, piece.b, piece.b0, piece.b1, visit);
-    }
-
-    template <class Visit> void within(int64_t at, int64_t begin, int64_t end, const Visit& visit) const {
-        if (end - begin <= LEAF) {
-            for (int64_t i = begin; i < end; ++i)
-                for (int64_t j = i + 1; j < end; ++j)
-                    if (overlap(face[i], face[j])) visit(i, j);
-            return;
-        }
-        const int64_t middle = (begin + end) / 2;
-        within(2 * at + 1, begin, middle, visit);
-        within(2 * at + 2, middle, end, visit);
-        between(2 * at + 1, begin, middle, 2 * at + 2, middle, end, visit);
     }
 
     // visit(j) for faces whose boxes overlap a box.
@@ -315,10 +321,13 @@ struct LayerTree {
         around(box, 2 * at + 2, middle, end, visit);
     }
 
+    // The same between two nodes whose boxes overlap.
     template <class Visit>
     void between(int64_t a, int64_t a0, int64_t a1, int64_t b, int64_t b0, int64_t b1, const Visit& visit) const {
-        if (!overlap(node[a], node[b])) return;
         const bool leaf_a = a1 - a0 <= LEAF, leaf_b = b1 - b0 <= LEAF;
+        const auto go_on = [&](int64_t one, int64_t begin, int64_t end, int64_t other, int64_t first, int64_t last) {
+            if (overlap(node[one], node[other])) between(one, begin, end, other, first, last, visit);
+        };
         if (leaf_a && leaf_b) {
             for (int64_t i = a0; i < a1; ++i) {
                 if (!overlap(face[i], node[b])) continue;
@@ -327,12 +336,10 @@ struct LayerTree {
             }
         } else if (halves_first(a1 - a0, b1 - b0)) {
             const int64_t middle = (a0 + a1) / 2;
-            between(2 * a + 1, a0, middle, b, b0, b1, visit);
-            between(2 * a + 2, middle, a1, b, b0, b1, visit);
+            go_on(2 * a + 1, a0, middle, b, b0, b1), go_on(2 * a + 2, middle, a1, b, b0, b1);
         } else {
             const int64_t middle = (b0 + b1) / 2;
-            between(a, a0, a1, 2 * b + 1, b0, middle, visit);
-            between(a, a0, a1, 2 * b + 2, middle, b1, visit);
+            go_on(a, a0, a1, 2 * b + 1, b0, middle), go_on(a, a0, a1, 2 * b + 2, middle, b1);
         }
     }
 };

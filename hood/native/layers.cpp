@@ -39,6 +39,11 @@ void layers_restart(void* handle) { ((Layers*)handle)->restart(); }
 // Whether nothing is within its reach and so much beyond it [m] at positions.
 int64_t layers_apart(void* handle, const double* pos, double spare) { return ((Layers*)handle)->apart_at(pos, spare); }
 
+// Whether ways are free, and what is at their ends apart: see Layers.
+int64_t layers_free_way(void* handle, const double* now, const double* end, double left, double spare) {
+    return ((Layers*)handle)->free_way(now, end, left, spare);
+}
+
 // Targets that can be reached become ``to``; returns how many pairs are left out for it.
 int64_t layers_approach(void* handle, double* to, double left) {
     return ((Layers*)handle)->approach(to, left);

@@ -98,13 +98,12 @@ struct Layers {
     std::vector<double> bounds;  // of the distances of the pairs, and what the cloth had moved when they were found [m]
     std::vector<LayerContact> contacts;  // of the last model
     int64_t threads = 1;
-    LayerTree tree;
     std::vector<double> start, ahead;  // (3 V) where the step begins, and where it may end
     std::vector<double> resort;        // (3 V) where ways lead that are known to be free; or none
     // The ways that the list is for, the margins then, where the cloth was last and how far it has moved since.
     std::vector<double> from, to, room, last;
     bool moving = false;  // whether the ways lead anywhere
-    double moved = 0.0, most_reach = 0.0;
+    double moved = 0.0, most_reach = 0.0, most_room = 0.0;
     bool begun = false;   // whether there is a list
     bool known_apart = false;  // nothing is near or through anything where the step begins
     int64_t searches = 0, refreshes = 0, crossed = 0;  // pairs of faces that are crossed where it begins
@@ -139,6 +138,13 @@ struct Layers {
 
         int64_t count() const { return candidates[0].count + candidates[1].count + beside[0].count + beside[1].count; }
     };
+    // Memory that the next search of a thread uses again.
+    struct Memory {
+        std::vector<Found> found;
+        LayerTree tree;
+        std::vector<double> wide, middle, half;  // (V), (4 V) where vertices are halfway, and half of their ways
+    };
+    Memory* memory = nullptr;  // of the search that goes on
     std::vector<std::array<int32_t, 2>> found_at;  // of the pairs that the last search has found of a kind
     // What all parts of a search have found together, told after every so many pairs of faces: where that is too much, all end.
     struct Tally {
@@ -146,7 +152,6 @@ struct Layers {
         std::atomic<bool> over{false};
     };
     static constexpr int64_t NOW_AND_THEN = 256;
-    std::vector<double> wide;
     std::vector<int32_t> strays;
     // For the solver.
     LayerView view = {};
@@ -186,10 +191,8 @@ struct Layers {
         if (some) return fill_around(*some);
         // Parts that are done early leave the others to the threads; what is found does not depend on their number.
         const int64_t parts = std::min(threads > 1 ? PARTS * threads : 1, MOST_PARTS);
-        const std::vector<LayerTree::Piece> pieces = tree.pieces(parts > 1 ? mesh.num_faces / (2 * parts) : mesh.num_faces);
         const auto visit = [&](int64_t part, const auto& look) {
-            const Range mine = range_of(pieces.size(), part, parts);
-            for (int64_t i = mine.begin; i < mine.end; ++i) tree.pairs(pieces[i], look);
+            memory->tree.pairs(*mesh.topology, range_of(mesh.topology->steps.size(), part, parts), look);
         };
         fill(parts, visit, first, nullptr);
     }
@@ -199,7 +202,7 @@ struct Layers {
         const auto visit = [&](int64_t, const auto& look) {
             for (int64_t i = 0; i < mesh.num_faces; ++i) {
                 if (!any_of(corners_at(i), 3, some)) continue;
-                tree.around(tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
+                memory->tree.around(memory->tree.face[i], 0, 0, mesh.num_faces, [&](int64_t j) {
                     if (i != j && (i < j || !any_of(corners_at(j), 3, some))) look(i, j);
                 });
             }
@@ -238,25 +241,36 @@ struct Layers {
     }
 
     void make_boxes() {
-        wide.resize(mesh.num_vertices);
-        for (int64_t v = 0; v < mesh.num_vertices; ++v) wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
-        tree.enclose(from.data(), to.data(), wide);
-        tree.build(mesh, threads);
+        thread_local Memory kept;
+        memory = &kept;
+        std::vector<double>&wide = kept.wide, &middle = kept.middle, &half = kept.half;
+        wide.resize(mesh.num_vertices), middle.resize(4 * mesh.num_vertices), half.resize(4 * mesh.num_vertices);
+        most_room = 0.0;
+        for (int64_t v = 0; v < mesh.num_vertices; ++v) {
+            most_room = std::max(most_room, room[v]), wide[v] = room[v] + 0.5 * mesh.reach[v] + SLACK;
+            for (int64_t k = 0; k < 3; ++k) {
+                const double a = from[3 * v + k], b = to[3 * v + k];
+                middle[4 * v + k] = 0.5 * (a + b), half[4 * v + k] = 0.5 * (b - a);
+            }
+        }
+        kept.tree.enclose(from.data(), to.data(), wide);
+        kept.tree.build(mesh, threads);
     }
 
     // Adds pairs of features of the pairs of faces that are visited; where ``stray`` is given, only those with such a vertex.
     template <class Faces> void fill(int64_t parts, const Faces& visit, bool first, const std::vector<uint8_t>* stray) {
-        std::vector<Found>& found = memory();  // of this thread, not of those that help
+        std::vector<Found>& found = memory->found;
         if ((int64_t)found.size() < parts) found.resize(parts);
         Tally tally;
+        tally.looked_at = stray ? 0 : mesh.topology->num_beside;
         for_parts(parts, [&](int64_t part) {
             Found& mine = found[part];
             mine.looked_at = mine.crossed = mine.told = 0, mine.released.clear();
             for (int edges = 0; edges < 2; ++edges) mine.candidates[edges].count = mine.beside[edges].count = 0;
             if (!stray) list_beside(part, parts, mine);
-            visit(part, [&](int64_t i, int64_t j) { look_at(i, j, first, stray, mine, tally); });
+            visit(part, [&](int64_t i, int64_t j) { look_at(i, j, first, mine, tally); });
         });
-        int64_t looked_at = 0, count = 0;
+        int64_t looked_at = stray ? 0 : mesh.topology->num_beside, count = 0;
         for (int64_t part = 0; part < parts; ++part) looked_at += found[part].looked_at, count += found[part].count();
         overflowed = too_many(looked_at, count);
         if (overflowed) {
@@ -285,16 +299,10 @@ struct Layers {
         }
     }
 
-    // Memory that the next search of a thread uses again.
-    static std::vector<Found>& memory() {
-        thread_local std::vector<Found> kept;
-        return kept;
-    }
-
     bool too_many(int64_t looked_at, int64_t count) const { return looked_at > MOST_LOOKS * mesh.num_faces || count > MOST_PAIRS; }
 
     // Takes up the pairs of features of two faces whose boxes overlap.
-    void look_at(int64_t i, int64_t j, bool first, const std::vector<uint8_t>* stray, Found& mine, Tally& tally) const {
+    void look_at(int64_t i, int64_t j, bool first, Found& mine, Tally& tally) const {
         if (tally.over.load(std::memory_order_relaxed)) return;
         if (mine.looked_at && mine.looked_at % NOW_AND_THEN == 0) {
             const int64_t count = mine.count(), more = count - mine.told;
@@ -304,7 +312,6 @@ struct Layers {
         const LayerTopology& topology = *mesh.topology;
         const OwnFeatures &vertices = topology.vertices, &edges = topology.edges;
         ++mine.looked_at;
-        if (!stray && topology.meet(i, j)) return;
         if (first && crossed_faces(mesh.order[i], mesh.order[j], from.data())) ++mine.crossed, release_faces(mesh.order[i], mesh.order[j], mine.released);
         mine.candidates[0].make_room(6), mine.candidates[1].make_room(9);
         for (int32_t v = vertices.starts[i]; v < vertices.starts[i + 1]; ++v) consider_vertex(v, j, i, j, mine.candidates[0]);
@@ -321,6 +328,7 @@ struct Layers {
     // Pairs of faces with a common vertex whose boxes overlap, of a part of what is known of them.
     void list_beside(int64_t part, int64_t parts, Found& mine) const {
         for (int edges = 0; edges < 2; ++edges) {
+            const LayerTree& tree = memory->tree;
             const std::vector<MovingBox>&one = edges ? tree.own_edge : tree.own_vertex, &other = edges ? tree.own_edge : tree.face;
             const std::vector<Candidate>& known = mesh.topology->beside[edges];
             const std::vector<std::array<int32_t, 2>>& boxes = mesh.topology->boxes[edges];
@@ -349,13 +357,13 @@ struct Layers {
     // Features by their places in the tree, of the faces i and j.
     void consider_vertex(int32_t place, int64_t at_face, int64_t i, int64_t j, Candidates& to) const {
         const int32_t v = mesh.topology->vertices.number[place];
-        const bool near = overlap(tree.own_vertex[place], tree.face[at_face]) & !mesh.topology->holds(at_face, v);
+        const bool near = overlap(memory->tree.own_vertex[place], memory->tree.face[at_face]) & !mesh.topology->holds(at_face, v);
         to.offer({v, mesh.order[at_face], {(int32_t)i, (int32_t)j}}, near);
     }
 
     void consider_edges(int32_t place, int32_t other, int64_t i, int64_t j, Candidates& to) const {
         const int32_t a = mesh.topology->edges.number[place], b = mesh.topology->edges.number[other];
-        const bool near = overlap(tree.own_edge[place], tree.own_edge[other]) & !LayerTopology::meet(mesh, a, b);
+        const bool near = overlap(memory->tree.own_edge[place], memory->tree.own_edge[other]) & !LayerTopology::meet(mesh, a, b);
         to.offer({std::min(a, b), std::max(a, b), {(int32_t)i, (int32_t)j}}, near);
     }
 
@@ -378,18 +386,14 @@ struct Layers {
         const std::vector<Candidate>& list = given.list;
         const int count = (int)std::min<size_t>(AT_ONCE, given.count - begin), split = edges ? 2 : 1;
         int32_t corner[AT_ONCE][4];
-        alignas(64) double middle[4][3][AT_ONCE], half[4][3][AT_ONCE];
-        for (int lane = 0; lane < AT_ONCE; ++lane) {
-            corners_of(edges, list[begin + std::min(lane, count - 1)], corner[lane]);
-            for (int c = 0; c < 4; ++c) {
-                const double *a = from.data() + 3 * (int64_t)corner[lane][c], *b = to.data() + 3 * (int64_t)corner[lane][c];
-                for (int k = 0; k < 3; ++k) middle[c][k][lane] = 0.5 * (a[k] + b[k]), half[c][k][lane] = 0.5 * (b[k] - a[k]);
-            }
-        }
+        for (int lane = 0; lane < AT_ONCE; ++lane) corners_of(edges, list[begin + std::min(lane, count - 1)], corner[lane]);
+        const auto place = [&](const std::vector<double>& of, int c, int k) {
+            return gather([&](int lane) { return of[4 * (int64_t)corner[lane][c] + k]; });
+        };
         Lanes3 x[4], p[4];
         for (int c = 0; c < 4; ++c) {
-            x[c] = {load<VN>(middle[c][0]), load<VN>(middle[c][1]), load<VN>(middle[c][2])};
-            p[c] = {load<VN>(half[c][0]), load<VN>(half[c][1]), load<VN>(half[c][2])};
+            x[c] = {place(memory->middle, c, 0), place(memory->middle, c, 1), place(memory->middle, c, 2)};
+            p[c] = {place(memory->half, c, 0), place(memory->half, c, 1), place(memory->half, c, 2)};
         }
         const VN square = edges ? segment_segment_sq(x) : point_triangle_sq(x);
         VN way[2] = {every(0.0), every(0.0)};
@@ -401,15 +405,17 @@ struct Layers {
                 way[c >= split] = more(way[c >= split], dot(own, own));
             }
         }
+        const VN bounds = root(square) - (moving ? root(way[0]) + root(way[1]) : every(0.0)) - SLACK;
+        const double most = most_reach + most_room + most_room;
         for (int lane = 0; lane < count; ++lane) {
-            if ((stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
+            const double bound = bounds[lane];
+            if (bound > most || (stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
             if (!whole && fixed[corner[lane][0]] && fixed[corner[lane][1]] && fixed[corner[lane][2]] && fixed[corner[lane][3]]) continue;
             double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
             for (int c = 0; c < 4; ++c) {
                 off[c >= split] = std::max(off[c >= split], room[corner[lane][c]]);
                 reach = std::min(reach, mesh.reach[corner[lane][c]]);
             }
-            const double bound = std::sqrt(square[lane]) - (moving ? std::sqrt(way[0][lane]) + std::sqrt(way[1][lane]) : 0.0) - SLACK;
             if (bound > reach + off[0] + off[1]) continue;
             // Vertices that were looked for alone are off the middle of their ways, at a time when the cloth has moved already.
             add(edges, list[begin + lane], corner[lane], reach, stray ? bound - off[0] - off[1] + moved : bound, into);
@@ -482,6 +488,34 @@ struct Layers {
             if (!(dist > pairs[i].reach + spare)) return false;
         }
         return true;
+    }
+
+    // Whether no two features meet on straight ways between positions (V, 3), nor are within their reach where those end: 2 where
+    // nothing is so much beyond it there either. Where the answer is no, nothing else can be asked before a restart.
+    int64_t free_way(const double* now, const double* end, double left, double spare) {
+        const LayerTimer timer(clock, LayerClock::LIMIT);
+        if (begun || !known_apart) {
+            const bool free = limit(now, end, left) >= 1.0 && model(end) == 0;
+            return free + (free && apart_at(end, spare));
+        }
+        // These ways alone count: no vertex is off them, and few pairs are listed.
+        const std::vector<double> given = margin;
+        margin.assign(given.size(), spare);
+        search(now, end);
+        margin = given;
+        bool apart = !overflowed;
+        for (const LayerPair& pair : pairs) {
+            Vec x[4], p[4];
+            for (int c = 0; c < 4; ++c) x[c] = at(now, pair.corner[c]), p[c] = at(end, pair.corner[c]) - x[c];
+            double dist, weight[4];
+            const double way = relative_way(pair.edges, p);
+            if (safe_share(pair.edges, x, p, way, left, near_of(pair), &dist) < 1.0) return 0;
+            for (int c = 0; c < 4; ++c) x[c] = at(end, pair.corner[c]);
+            dist = std::sqrt(pair_distance_sq(pair.edges, x, weight));
+            if (dist < pair.reach) return 0;
+            apart &= dist > pair.reach + spare;
+        }
+        return 1 + apart;
     }
 
     // Distances do not change where all cloth is shifted: how far positions (V, 3) are off the ways on average, some share along.

@@ -99,11 +99,7 @@ def approached(layers: tuple[SceneLayers, ...], target: Tensor) -> Tensor:
 
 def limits(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
     """Shares (B,) of the straight ways from ``now`` to ``there`` (V, 3) on which no cloth meets cloth."""
-    return now.new_tensor(_limits(layers, now, there))
-
-
-def _limits(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> list[float]:
-    return [scene.layers.limit(scene.of(now), scene.of(there)) for scene in layers]
+    return now.new_tensor([scene.layers.limit(scene.of(now), scene.of(there)) for scene in layers])
 
 
 def eased(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> Tensor:
@@ -120,11 +116,11 @@ def touching(layers: tuple[SceneLayers, ...], pos: Tensor) -> bool:
 def free_way(layers: tuple[SceneLayers, ...], now: Tensor, there: Tensor) -> bool:
     """Whether no cloth meets cloth on the straight ways from ``now`` to ``there`` (V, 3), nor is near any there. A step from
     there needs no search to begin with; where cloth does, it is as if this had not been asked."""
-    free = min(_limits(layers, now, there), default=1.0) >= 1.0
-    if not free or any(len(scene.layers.contacts(scene.of(there)).corners) for scene in layers):
-        for scene in layers:
+    answers = [scene.layers.free_way(scene.of(now), scene.of(there)) for scene in layers]
+    free = all(answer for answer, _ in answers)
+    for scene, (_, apart) in zip(layers, answers, strict=True):
+        if not free:
             scene.layers.restart()
-        return False
-    for scene in layers:
-        scene.layers.remember_apart(scene.of(there))
-    return True
+        elif apart:
+            scene.layers.remember_apart(scene.of(there), known=True)
+    return free
