@@ -72,7 +72,7 @@ class Walls:
         return contact_force(self.weight, self.depth(pos))
 
     def take(self, rows: Tensor) -> Walls:
-        """Those of some rows."""
+        """Those of some rows, int64."""
         weight = self.weight.index_select(0, rows) if isinstance(self.weight, Tensor) and self.weight.ndim else self.weight
         return Walls(weight, *(values.index_select(0, rows) for values in (self.point, self.normal, self.reach)))
 

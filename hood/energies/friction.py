@@ -44,7 +44,7 @@ class Grip:
         return slip - dot_rows(slip, self.normal)[:, None] * self.normal
 
     def take(self, rows: Tensor) -> Grip:
-        """Those of some rows."""
+        """Those of some rows, int64."""
         return Grip(*(values.index_select(0, rows) for values in (self.force, self.normal, self.anchor, self.limit)))
 
 

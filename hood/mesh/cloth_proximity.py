@@ -272,7 +272,7 @@ class ClothSurface:
         self._lib.layers_restart(self.handle)
 
     def remember_apart(self, pos: np.ndarray, known: bool = False) -> None:
-        """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything at ``pos``, or that is known."""
+        """Spare the next step from ``pos`` (V, 3) its search there, if nothing is near anything there, or that is known."""
         here = _positions(pos)
         if known or self._lib.layers_apart(self.handle, here.ctypes.data, SPARE):
             self.mesh.apart = _Apart(here.copy(), self._held, self.between)

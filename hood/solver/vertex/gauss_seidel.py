@@ -232,7 +232,10 @@ def neighbourhoods(terms: StepTerms) -> list[Neighbourhood]:
                 terms.face_constants.take(faces.element, faces.own),
                 Corners(cloth.hinges[hinges.element]),
                 terms.hinge_constants.take(hinges.element),
-                tuple(points.take(torch.isin(points.vertices, colour.vertices).any(dim=1)) for points in terms.points),
+                tuple(
+                    points.take(torch.isin(points.vertices, colour.vertices).any(dim=1).argwhere().squeeze(1))
+                    for points in terms.points
+                ),
                 springs,
             )
         )
