@@ -234,6 +234,26 @@ def test_where_cloth_is_known_to_be_apart_no_search_is_made() -> None:
         assert other.work.searches == 1
 
 
+def test_a_free_way_is_told_as_from_the_list() -> None:
+    """Sheets shifted towards, through and along each other, from where they are known to be apart and not."""
+    mesh, pos, _ = _sheets()
+    rng, answers = np.random.default_rng(8), []
+    for turn in range(60):
+        _layers(mesh, pos).remember_apart(pos)
+        there = pos + 1e-3 * rng.normal(size=pos.shape)
+        there[len(pos) // 2 :] += [0.002 * turn, -0.0004 * turn, 0.0]
+        known, listed = _layers(mesh, pos), _layers(mesh, pos)
+        assert known.crossed == known.work.searches == 0
+        mesh.apart = None
+        fresh = _layers(mesh, pos)
+        assert fresh.crossed == 0
+        found = known.free_way(pos, there)
+        assert found == fresh.free_way(pos, there)
+        assert found[0] == (listed.limit(pos, there) == 1.0 and not len(listed.contacts(there).corners))
+        answers.append(found[0])
+    assert 10 < sum(answers) < 50
+
+
 def test_limited_moves_cross_nothing() -> None:
     mesh, pos, faces = _sheets()
     rng = np.random.default_rng(2)
