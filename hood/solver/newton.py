@@ -307,7 +307,7 @@ def _say_once(sentence: str) -> None:
 
 
 def run(system: System, like: Tensor, settings: NewtonSettings, began: float, proceed: Proceed | None) -> tuple[Tensor, Report]:
-    """The iterations of ``system``: positions (V, 3) and a report in the precision and on the device of ``like``."""
+    """The iterations of ``system``: positions (V, 3) and a report, float64, on the device of ``like``."""
     phi = system.phi
     finite, stuck, why = [math.isfinite(value) for value in phi], [False] * len(phi), MOST_ITERATIONS
     course: list[Iteration] = []

@@ -137,7 +137,7 @@ class CompiledScene:
         values.num_walls, values.num_grips, values.num_points = len(step.walls), len(step.grips), len(own)
         values.bending, values.membrane = step.bending, step.membrane > 0
         values.dt_sq = float(step.dt[scene]) ** 2
-        values.raised, values.cg_used = 0.0, 0
+        values.raised, values.cg_used, values.modelled = 0.0, 0, 0
         self._take_damping(step)
         self._take_layers(step.layers[scene] if step.layers else None)
         self._take_layer_grips(step.layer_grips, scene, step.cloth.num_vertices)
