@@ -96,7 +96,7 @@ def systems(garment: str, motion: str, frames: int) -> Iterator[System]:
         (scene,), number = system._engines, 0
         while (residual := system.model()[0]) > SETTINGS.target_rg:
             scene.matrix()
-            starts, cols, size = scene.array("row_starts"), scene.array("cols"), scene.values.num_rows
+            starts, cols, size = scene.tables.row_starts, scene.tables.cols, scene.values.num_rows
             blocks = scene.tables.blocks(scene.array("matrix")).astype(np.float64)
             above = np.repeat(np.arange(size), np.diff(starts)) != cols
             shape = (3 * size, 3 * size)

@@ -409,7 +409,8 @@ struct Layers {
         const double most = most_reach + most_room + most_room;
         for (int lane = 0; lane < count; ++lane) {
             const double bound = bounds[lane];
-            if (bound > most || (stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
+            if (bound > most) continue;
+            if ((stray && !any_of(corner[lane], 4, *stray)) || (between && mesh.piece[corner[lane][0]] == mesh.piece[corner[lane][3]])) continue;
             if (!whole && fixed[corner[lane][0]] && fixed[corner[lane][1]] && fixed[corner[lane][2]] && fixed[corner[lane][3]]) continue;
             double off[2] = {0.0, 0.0}, reach = mesh.reach[corner[lane][0]];
             for (int c = 0; c < 4; ++c) {

@@ -56,10 +56,10 @@ struct OtherTerms {
 
 struct Engine {
     // The cloth: constant as long as its plan.
-    int64_t num_vertices, num_rows, num_faces, num_hinges, num_blocks, num_springs, most_blocks;  // elements padded to a multiple of 8
+    int64_t num_vertices, num_rows, num_faces, num_hinges, num_springs, most_blocks;  // elements padded to a multiple of 8
     const int64_t* vertex;                        // (V) original number of each vertex
     const int32_t *face_corners, *hinge_corners;  // (3, F), (4, H)
-    const int32_t *row_starts, *cols;             // (N + 1), (R) block rows and columns
+    const int32_t* row_starts;                    // (N + 1) blocks of the rows
     // Rows of the linear system in pairs of no neighbours, P of them: a sliced ELLPACK format of two rows (Kreutzer et al. 2014).
     int64_t num_pairs;
     const int32_t *slot, *row_of_slot;            // (N) twice the pair, and 1 in its second half; (2 P), -1 where a half is empty

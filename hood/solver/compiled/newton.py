@@ -58,8 +58,8 @@ class _Engine(ctypes.Structure):
     """``Engine`` of ``newton.cpp``."""
 
     _fields_ = [
-        *fields("num_vertices num_rows num_faces num_hinges num_blocks num_springs most_blocks", COUNT),
-        *fields("vertex face_corners hinge_corners row_starts cols", POINTER),
+        *fields("num_vertices num_rows num_faces num_hinges num_springs most_blocks", COUNT),
+        *fields("vertex face_corners hinge_corners row_starts", POINTER),
         *fields("num_pairs", COUNT),
         *fields("slot row_of_slot pair_starts pair_cols", POINTER),
         *fields("face_starts face_uses hinge_starts hinge_uses spring_starts spring_uses spring_ends", POINTER),

@@ -56,7 +56,6 @@ class CompiledScene:
             num_rows=tables.num_rows,
             num_faces=tables.faces.corners.shape[1],
             num_hinges=tables.hinges.corners.shape[1],
-            num_blocks=len(tables.cols),
             num_springs=len(tables.springs.order),
             most_blocks=tables.most_blocks,
             num_pairs=len(tables.pairs.starts) - 1,
@@ -68,7 +67,6 @@ class CompiledScene:
             face_corners=tables.faces.corners,
             hinge_corners=tables.hinges.corners,
             row_starts=tables.row_starts,
-            cols=tables.cols,
             slot=tables.pairs.slot,
             row_of_slot=tables.pairs.row,
             pair_starts=tables.pairs.starts,
@@ -109,7 +107,7 @@ class CompiledScene:
     def _working_memory(self) -> dict[str, np.ndarray]:
         values, kind = self.values, np.float64 if self.wide else np.float32
         rows, pairs = values.num_rows, values.num_pairs
-        sizes = {"indefinite_part": values.num_blocks, "own": 6 * rows, "own_indefinite_part": 6 * rows}
+        sizes = {"indefinite_part": len(self.tables.cols), "own": 6 * rows, "own_indefinite_part": 6 * rows}
         sizes |= {"matrix": 24 * len(self.tables.pairs.cols), **dict.fromkeys(("block", "inverse"), 24 * pairs)}
         memory = {name: _aligned(count, kind) for name, count in (sizes | dict.fromkeys("xrzpq", 8 * pairs)).items()}
         memory |= self.tables.border(values.parts, kind)
