@@ -43,19 +43,21 @@ inline double point_triangle(Vec p, Vec a, Vec b, Vec c, double* weight) {
     return best;
 }
 
-// The same for two segments.
+// The same for two segments. Of edges that are parallel but for rounding, the solution inside is anywhere: an end that is nearer
+// counts.
 inline double segment_segment(Vec a, Vec b, Vec c, Vec d, double* weight) {
     const Vec u = b - a, v = d - c, w = a - c;
     const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), uw = dot(u, w), vw = dot(v, w), det = uu * vv - uv * uv;
+    double best = std::numeric_limits<double>::infinity(), share;
     if (det > 1e-24 * uu * vv) {
         const double s = (uv * vw - vv * uw) / det, t = (uu * vw - uv * uw) / det;
         if (s >= 0.0 && s <= 1.0 && t >= 0.0 && t <= 1.0) {
             const Vec gap = w + s * u - t * v;
             weight[0] = 1.0 - s, weight[1] = s, weight[2] = t - 1.0, weight[3] = -t;
-            return dot(gap, gap);
+            best = dot(gap, gap);
+            if (det > 1e-12 * uu * vv) return best;
         }
     }
-    double best = std::numeric_limits<double>::infinity(), share;
     const Vec end[4] = {a, b, c, d};
     for (int i = 0; i < 4; ++i) {
         const double square = i < 2 ? point_segment(end[i], c, d, &share) : point_segment(end[i], a, b, &share);

@@ -387,7 +387,7 @@ inline VN segment_segment_sq(const Lanes3* x) {
     const VN scale = 1.0 / (sound ? det : one), s = (uv * vw - vv * uw) * scale, t = (uu * vw - uv * uw) * scale;
     const IN inside = sound & (s >= zero) & (s <= one) & (t >= zero) & (t <= one);
     const Lanes3 gap = {w.x + s * u.x - t * v.x, w.y + s * u.y - t * v.y, w.z + s * u.z - t * v.z};
-    return inside ? dot(gap, gap) : best;
+    return inside ? less(dot(gap, gap), best) : best;
 }
 
 }  // namespace

@@ -249,7 +249,7 @@ def minimize_held_off(
     least = problem.num_in_skin(pos)
     misses = torch.zeros_like(least) if report is None else (~report.converged).to(least)
     unsolved = misses > 0
-    while again is not problem:
+    while again is not problem and rounds < MOST_RAISED:
         problem = again
         pos, found = minimize(potential, problem, pos, settings)
         pos = torch.where(torch.isfinite(pos), pos, best.pos)  # what is no number is missed, and no place to go on from
@@ -263,7 +263,8 @@ def minimize_held_off(
         unsolved = unsolved & ~better
         least = torch.where(better, count, least)
         best = _by_scene(better, HeldOff(problem, pos, found, 0, 0), best)
-        again = problem.with_held_off(pos, misses < MOST_MISSES) if rounds < MOST_RAISED else problem
+        if rounds < MOST_RAISED:
+            again = problem.with_held_off(pos, misses < MOST_MISSES)
     return best._replace(rounds=rounds, iterations=spent)
 
 

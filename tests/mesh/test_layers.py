@@ -101,9 +101,10 @@ def _all_pairs(mesh: LayerMesh, faces: np.ndarray, pos: np.ndarray) -> dict[tupl
     # Between the ends the distance of the lines, where its foot is on both.
     u, v, w = b - a, d - c, a - c
     uu, uv, vv, uw, vw = ((x * y).sum(1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
-    det = np.maximum(uu * vv - uv * uv, 1e-300)
-    s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
-    between = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & (det > 1e-12 * uu * vv)
+    det = uu * vv - uv * uv
+    sound = det > 1e-12 * uu * vv
+    s, t = (np.where(sound, share, -1.0) / np.where(sound, det, 1.0) for share in (uv * vw - vv * uw, uu * vw - uv * uw))
+    between = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
     dist = np.where(between, np.minimum(dist, np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)), dist)
     return found | {(1, *pair): far for pair, far in zip(corners.tolist(), dist.tolist(), strict=True)}
 
@@ -175,6 +176,20 @@ def test_cloth_where_all_is_near_all_is_told_of_and_takes_no_more_memory_with_ma
     *found, kilobytes = run.stdout.split()
     assert found == ["0", "0", "0", "True"]
     assert int(kilobytes) < 500_000
+
+
+def test_parallel_edges_are_as_far_apart_as_their_ends_say() -> None:
+    """Of edges whose directions are the same but for rounding: shares from their nearly singular equations are no answer."""
+    rng = np.random.default_rng(6)
+    for count in range(30, 40):
+        start = 0.3 * np.arange(count)[:, None] * np.eye(3)[0] + 0.05 * rng.normal(size=(count, 3))
+        along, aside, tip, scale, shift = (rng.normal(size=(count, k)) for k in (3, 3, 3, 1, 1))
+        along, aside = 0.02 * along, 1e-3 * aside
+        other = start + aside + 0.5 * shift * along
+        pos = np.concatenate([start, start + along, start + 0.05 * tip, other, other + scale * along, other - 0.05 * tip])
+        faces = np.arange(6 * count).reshape(6, count).T.reshape(-1, 3)
+        mesh = LayerMesh(pos, faces, 3e-3)
+        assert _require_all_pairs(_layers(mesh, pos), faces, pos) > 10
 
 
 def test_pairs_in_reach_are_those_of_all_pairs_whatever_was_asked_before() -> None:
