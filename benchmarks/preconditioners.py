@@ -255,9 +255,10 @@ def in_parts(garment: str, motion: str, frames: int, parts: list[int]) -> dict[s
                 engine.share(count)
                 engine.model()
                 engine.matrix()
+                border, before = engine.values.num_border, engine.values.cg_used
                 engine.values.num_border *= not usual
-                before = engine.values.cg_used
                 engine.solve(right, float(np.clip(residual**0.5, *TOLERANCES)), SETTINGS.cg_iterations, found)
+                engine.values.num_border = border
                 name = f"{count}, usual" if usual else f"{count}"
                 used[name] = used.get(name, 0) + engine.values.cg_used - before
             engine.share(1)

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <initializer_list>
 #include <numeric>
 #include <vector>
 
@@ -213,6 +214,63 @@ struct Parts {
     void join(int64_t a, int64_t b) { above[root(a)] = root(b); }
 };
 
+// What passes through what between the leaves of a first mesh and a second one, which is the same where pairs of one are asked for.
+struct Search {
+    const Eights &first, &second;
+    const Levels levels;
+    const int64_t same;
+    const double touch;
+    std::vector<int64_t>* found;  // rows of pairs, of edges of the first and of edges of the second
+
+    void put(int which, std::initializer_list<int64_t> row) const { found[which].insert(found[which].end(), row); }
+
+    void examine(const Triangle& a, const Triangle& b) const {
+        int side[3], other_side[3], turn[3][3];
+        sides(a, b, touch, side), sides(b, a, touch, other_side);
+        for (int i = 0; i < 3; ++i) {
+            const Vec start = a.corner[EDGE[i][0]], along = a.corner[EDGE[i][1]] - start;
+            const Vec moved[3] = {b.corner[0] - start, b.corner[1] - start, b.corner[2] - start};
+            for (int j = 0; j < 3; ++j) turn[i][j] = sign(dot(along, cross(moved[EDGE[j][0]], moved[EDGE[j][1]])));
+        }
+        bool crossed = false;
+        for (int i = 0; i < 3; ++i) {
+            const int *ends = EDGE[i], here = side[ends[0]] * side[ends[1]], there = other_side[ends[0]] * other_side[ends[1]];
+            if (here < 0 && inside(turn[i][0], turn[i][1], turn[i][2])) {
+                crossed = true;
+                put(1, {a.vertex[ends[0]], a.vertex[ends[1]], b.number});
+            }
+            if (there < 0 && inside(turn[0][i], turn[1][i], turn[2][i])) {
+                crossed = true;
+                put(2, {b.vertex[ends[0]], b.vertex[ends[1]], a.number});
+            }
+        }
+        if (crossed) put(0, {a.number, b.number});
+    }
+
+    void compare(int64_t leaf, int64_t other) const {
+        const double* boxes = second.boxes + 6 * LANES * other;
+        const uint64_t close = overlapped(first.boxes + 6 * LANES * leaf, box_in(second.groups + 6 * LANES * (other / LANES), other % LANES));
+        each_lane(close, [&](int i) {
+            uint64_t met = overlapped(boxes, box_in(first.boxes + 6 * LANES * leaf, i));
+            // Of two triangles of one leaf once.
+            if (same && leaf == other) met &= ((uint64_t)1 << 8 * i) - 1;
+            if (met && same) met &= strangers(first, leaf, i, other);
+            if (met) met &= straddling(first, leaf, i, second, other, touch);
+            each_lane(met, [&](int j) {
+                const Triangle a = triangle(first, leaf, i), b = triangle(second, other, j);
+                if (same && b.number < a.number) examine(b, a);
+                else examine(a, b);
+            });
+        });
+    }
+
+    void look_at(int64_t leaf) const {
+        const Box around = box_in(first.groups + 6 * LANES * (leaf / LANES), leaf % LANES);
+        visit_leaves(second.groups, levels, same ? leaf + 1 : second.num_leaves,
+                     [&](const double* boxes) { return overlapped(boxes, around); }, [&](int64_t other) { compare(leaf, other); });
+    }
+};
+
 }  // namespace
 
 extern "C" {
@@ -235,67 +293,36 @@ void crossing_order(Eights* e, const double* centre) {
     }
 }
 
-// Crossings of two meshes, or of pairs of one mesh's faces without a common vertex, the smaller number first (``same``).
-void crossing_find(const Eights* first, const Eights* second, int64_t same, double touch_share, Rows* rows) {
-    for (int k = 0; k < 3; ++k) rows->found[k] = 0;
-    if (!first->num_leaves || !second->num_leaves) return;
-    double origin[3], touch;
-    locate(*first, *second, origin, &touch);
-    touch *= touch_share;
-    place(*first, origin);
-    if (!same) place(*second, origin);
-    const auto put = [&](int which, int64_t* table, int width, int64_t x, int64_t y, int64_t z) {
-        int64_t* row = table + width * rows->found[which];
-        if (rows->found[which]++ >= rows->room[which]) return;
-        row[0] = x, row[1] = y;
-        if (width == 3) row[2] = z;
-    };
-    const auto examine = [&](const Triangle& a, const Triangle& b) {
-        int side[3], other_side[3], turn[3][3];
-        sides(a, b, touch, side), sides(b, a, touch, other_side);
-        for (int i = 0; i < 3; ++i) {
-            const Vec start = a.corner[EDGE[i][0]], along = a.corner[EDGE[i][1]] - start;
-            const Vec moved[3] = {b.corner[0] - start, b.corner[1] - start, b.corner[2] - start};
-            for (int j = 0; j < 3; ++j) turn[i][j] = sign(dot(along, cross(moved[EDGE[j][0]], moved[EDGE[j][1]])));
-        }
-        bool crossed = false;
-        for (int i = 0; i < 3; ++i) {
-            const int *ends = EDGE[i], here = side[ends[0]] * side[ends[1]], there = other_side[ends[0]] * other_side[ends[1]];
-            if (here < 0 && inside(turn[i][0], turn[i][1], turn[i][2])) {
-                crossed = true;
-                put(1, rows->first_edges, 3, a.vertex[ends[0]], a.vertex[ends[1]], b.number);
-            }
-            if (there < 0 && inside(turn[0][i], turn[1][i], turn[2][i])) {
-                crossed = true;
-                put(2, rows->second_edges, 3, b.vertex[ends[0]], b.vertex[ends[1]], a.number);
-            }
-        }
-        if (crossed) put(0, rows->pairs, 2, a.number, b.number, 0);
-    };
-    const Levels levels(second->num_leaves);
-    const auto compare = [&](int64_t leaf, int64_t other) {
-        const double* boxes = second->boxes + 6 * LANES * other;
-        const uint64_t close = overlapped(first->boxes + 6 * LANES * leaf, box_in(second->groups + 6 * LANES * (other / LANES), other % LANES));
-        each_lane(close, [&](int i) {
-            uint64_t met = overlapped(boxes, box_in(first->boxes + 6 * LANES * leaf, i));
-            // Of two triangles of one leaf once.
-            if (same && leaf == other) met &= ((uint64_t)1 << 8 * i) - 1;
-            if (met && same) met &= strangers(*first, leaf, i, other);
-            if (met) met &= straddling(*first, leaf, i, *second, other, touch);
-            each_lane(met, [&](int j) {
-                const Triangle a = triangle(*first, leaf, i), b = triangle(*second, other, j);
-                if (same && b.number < a.number) examine(b, a);
-                else examine(a, b);
-            });
+// Crossings of two meshes, or of pairs of one mesh's faces without a common vertex, the smaller number first (``same``). The leaves
+// of the first mesh are looked at in parts, by threads; what is found does not depend on it.
+void crossing_find(const Eights* first, const Eights* second, int64_t same, double touch_share, int64_t parts, Rows* rows) {
+    constexpr int WIDTH[3] = {2, 3, 3};
+    constexpr int64_t IN_TURN = 4;  // leaves that a part takes before it is the next one's turn
+    std::vector<std::vector<int64_t>> found(3 * parts);
+    if (first->num_leaves && second->num_leaves) {
+        double origin[3], touch;
+        locate(*first, *second, origin, &touch);
+        touch *= touch_share;
+        place(*first, origin, parts);
+        if (!same) place(*second, origin, parts);
+        for_parts(parts, [&](int64_t part) {
+            const Search search{*first, *second, Levels(second->num_leaves), same, touch, &found[3 * part]};
+            for (int64_t begin = IN_TURN * part; begin < first->num_leaves; begin += IN_TURN * parts)
+                for (int64_t leaf = begin; leaf < std::min(begin + IN_TURN, first->num_leaves); ++leaf) search.look_at(leaf);
         });
-    };
-    for (int64_t leaf = 0; leaf < first->num_leaves; ++leaf) {
-        const Box around = box_in(first->groups + 6 * LANES * (leaf / LANES), leaf % LANES);
-        visit_leaves(second->groups, levels, same ? leaf + 1 : second->num_leaves,
-                     [&](const double* boxes) { return overlapped(boxes, around); }, [&](int64_t other) { compare(leaf, other); });
     }
-    for (int k = 0; k < 3; ++k)
-        if (rows->found[k] > rows->room[k]) return;
+    int64_t* const table[3] = {rows->pairs, rows->first_edges, rows->second_edges};
+    bool fits = true;
+    for (int k = 0; k < 3; ++k) {
+        rows->found[k] = 0;
+        for (int64_t part = 0; part < parts; ++part) rows->found[k] += (int64_t)found[3 * part + k].size() / WIDTH[k];
+        fits &= rows->found[k] <= rows->room[k];
+    }
+    if (!fits) return;
+    for (int k = 0; k < 3; ++k) {
+        int64_t* end = table[k];
+        for (int64_t part = 0; part < parts; ++part) end = std::copy(found[3 * part + k].begin(), found[3 * part + k].end(), end);
+    }
     sort_rows<2>(rows->pairs, rows->found), sort_rows<3>(rows->first_edges, rows->found + 1), sort_rows<3>(rows->second_edges, rows->found + 2);
 }
 

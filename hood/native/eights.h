@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "lanes.h"
+#include "threads.h"
 #include "vector.h"
 
 extern "C" {
@@ -125,9 +126,10 @@ inline void visit_leaves(const double* groups, const Levels& levels, int64_t end
     }
 }
 
-// Takes up where the corners are now, about an origin. Triangles that are not finite get a box that overlaps nothing.
-inline void place(const Eights& e, const double* origin) {
-    for (int64_t leaf = 0; leaf < e.num_leaves; ++leaf) {
+// Takes up where the corners of some leaves are now, about an origin. Triangles that are not finite get a box that overlaps
+// nothing.
+inline void place_leaves(const Eights& e, const double* origin, Range leaves) {
+    for (int64_t leaf = leaves.begin; leaf < leaves.end; ++leaf) {
         double* corner = e.corner + 9 * LANES * leaf;
         const int32_t* vertex = e.vertex + 3 * LANES * leaf;
         for (int c = 0; c < 3; ++c)
@@ -150,14 +152,23 @@ inline void place(const Eights& e, const double* origin) {
         }
         e.has_normals[leaf] = 0;
     }
+}
+
+inline void place(const Eights& e, const double* origin, int64_t parts) {
+    for_parts(parts, [&](int64_t part) { place_leaves(e, origin, range_of(e.num_leaves, part, parts)); });
     fit_groups(e.boxes, e.num_leaves, e.groups);
 }
 
-// Unit normals of the triangles of a leaf.
+// Unit normals of the triangles of a leaf, made by the first thread that asks.
 inline const double* normals(const Eights& e, int64_t leaf) {
+    enum : uint8_t { NONE, BEGUN, MADE };
     double* normal = e.normal + 3 * LANES * leaf;
-    if (e.has_normals[leaf]) return normal;
-    e.has_normals[leaf] = 1;
+    uint8_t *state = e.has_normals + leaf, none = NONE;
+    if (__atomic_load_n(state, __ATOMIC_ACQUIRE) == MADE) return normal;
+    if (!__atomic_compare_exchange_n(state, &none, BEGUN, false, __ATOMIC_ACQUIRE, __ATOMIC_ACQUIRE)) {
+        while (__atomic_load_n(state, __ATOMIC_ACQUIRE) != MADE) pause_briefly();
+        return normal;
+    }
     for (int at = 0; at < LANES; at += AT_ONCE) {
         const double* corner = e.corner + 9 * LANES * leaf + at;
         VN first[3], second[3], product[3];
@@ -171,6 +182,7 @@ inline const double* normals(const Eights& e, int64_t leaf) {
         const IN flat = length <= limit;
         for (int k = 0; k < 3; ++k) store(normal + LANES * k + at, flat ? every(0.0) : 1.0 / length * product[k]);
     }
+    __atomic_store_n(state, MADE, __ATOMIC_RELEASE);
     return normal;
 }
 

@@ -10,6 +10,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 #include "element_laws.h"
 #include "layer_grips.h"
@@ -108,6 +109,9 @@ struct Engine {
     const double* outside;          // (K) which share of their neighbours these are
     void* border_blocks;            // (K, 24)
     int64_t num_border;
+    // Blocks between rows of two parts: slots of a row and of the other one, and where the block is in the matrix. Those that are
+    // to be transposed, of rows of the first part, then the others, and so on; where they begin (2 parts + 1).
+    const int32_t *outer_blocks, *outer_starts;
     // Cloth near cloth; none where there is no such term.
     LayerView* layers;
     const int64_t* vertex_of_scene;  // (V) number of each vertex in them
@@ -499,38 +503,55 @@ template <class T> void couple_layers(const Engine& e) {
 
 // ---- the potential -------------------------------------------------------------------------------------------------------
 
-void place(const Engine& e, const double* acc, double* pos) {
-    for (int64_t row = 0; row < e.num_rows; ++row) {
+void place(const Engine& e, const double* acc, double* pos, Range rows) {
+    for (int64_t row = rows.begin; row < rows.end; ++row) {
         const double* base = e.base + 3 * row;
         for (int k = 0; k < 3; ++k) pos[4 * row + k] = base[k] + e.dt_sq * acc[4 * row + k];
     }
 }
 
-// Potential at a placed state, and the rounding it is known to; with the elements' models there, which cost little more.
-void energy(const Engine& e, const double* pos, const double* acc, bool model, double* phi, double* noise) {
-    double inertia = 0.0, gravity = 0.0, sum = 0.0, size = 0.0;
-    for (int64_t row = 0; row < e.num_rows; ++row) {
-        inertia += 0.5 * e.inertia[row] * e.dt_sq * dot3(acc + 4 * row, acc + 4 * row);
+void place(const Engine& e, const double* acc, double* pos) { place(e, acc, pos, {0, e.num_rows}); }
+
+// Energies of some vertices: of inertia, of gravity, of every wall and of every grip.
+void vertex_energies(const Engine& e, const double* pos, const double* acc, Range rows, double* sums) {
+    double inertia = 0.0, gravity = 0.0;
+    for (int64_t row = rows.begin; row < rows.end; ++row) {
         gravity -= dot3(e.weight + 3 * row, pos + 4 * row);
-    }
-    for (int64_t row = e.num_rows; row < e.num_vertices; ++row) {
+        if (row < e.num_rows) {
+            inertia += 0.5 * e.inertia[row] * e.dt_sq * dot3(acc + 4 * row, acc + 4 * row);
+            continue;
+        }
         double moved[3];
         for (int k = 0; k < 3; ++k) moved[k] = pos[4 * row + k] - e.base[3 * row + k];
         inertia += 0.5 * e.inertia[row] / e.dt_sq * dot3(moved, moved);
-        gravity -= dot3(e.weight + 3 * row, pos + 4 * row);
     }
+    *sums++ = inertia, *sums++ = gravity;
+    const auto put = [&](const auto& of_row) {
+        double sum = 0.0;
+        for (int64_t row = rows.begin; row < rows.end; ++row) sum += of_row(row);
+        *sums++ = sum;
+    };
+    for (int64_t w = 0; w < e.num_walls; ++w) put([&](int64_t row) { return wall_energy(e.walls[w], row, pos + 4 * row); });
+    for (int64_t w = 0; w < e.num_grips; ++w) put([&](int64_t row) { return grip_energy(e.grips[w], row, pos + 4 * row); });
+}
+
+// Potential at a placed state, and the rounding it is known to; with the elements' models there, which cost little more.
+void energy(const Engine& e, const double* pos, const double* acc, bool model, double* phi, double* noise) {
+    double sum = 0.0, size = 0.0;
     const auto add = [&](double part) { sum += part, size += std::fabs(part); };
-    add(inertia);
-    add(gravity);
-    for (int64_t w = 0; w < e.num_walls; ++w) {
-        double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) part += wall_energy(e.walls[w], row, pos + 4 * row);
-        add(part);
-    }
-    for (int64_t w = 0; w < e.num_grips; ++w) {
-        double part = 0.0;
-        for (int64_t row = 0; row < e.num_vertices; ++row) part += grip_energy(e.grips[w], row, pos + 4 * row);
-        add(part);
+    const int64_t terms = 2 + e.num_walls + e.num_grips, stride = (terms + 7) / 8 * 8;  // a line of the cache, or several
+    std::vector<double> vertices(stride * e.parts);
+    Sums<double> faces, hinges;
+    for_parts(e.parts, [&](int64_t part) {
+        vertex_energies(e, pos, acc, range_of(e.num_vertices, part, e.parts), vertices.data() + stride * part);
+        const auto face_sum = model ? face_models<Real> : e.weave ? face_energy<weave_of> : face_energy<isotropic_of>;
+        if (e.membrane) faces[part] = face_sum(e, pos, faces_of(e, part));
+        if (e.bending) hinges[part] = (model ? hinge_models<Real> : hinge_energy)(e, pos, hinges_of(e, part));
+    });
+    for (int64_t term = 0; term < terms; ++term) {
+        double whole = vertices[term];
+        for (int64_t part = 1; part < e.parts; ++part) whole += vertices[stride * part + term];
+        add(whole);
     }
     for (int64_t s = 0; s < e.num_points; ++s) {
         const Points& set = e.points[s];
@@ -552,12 +573,6 @@ void energy(const Engine& e, const double* pos, const double* acc, bool model, d
             add(part);
         }
     }
-    Sums<double> faces, hinges;
-    for_parts(e.parts, [&](int64_t part) {
-        const auto face_sum = model ? face_models<Real> : e.weave ? face_energy<weave_of> : face_energy<isotropic_of>;
-        if (e.membrane) faces[part] = face_sum(e, pos, faces_of(e, part));
-        if (e.bending) hinges[part] = (model ? hinge_models<Real> : hinge_energy)(e, pos, hinges_of(e, part));
-    });
     if (e.membrane) add(faces.total(e.parts));
     if (e.bending) add(hinges.total(e.parts));
     double springs = 0.0;
@@ -885,27 +900,24 @@ template <class T> void sweep_back(const Engine& e, int64_t part, T share) {
 }
 
 // Adds to q of a part what the blocks between it and other parts make of p.
-template <class T> void couple_part(const Engine& e, Range range) {
+template <class T> void couple_part(const Engine& e, int64_t part) {
     typedef typename Four<T>::type V4;
     T* q = (T*)e.q;
     const T *p = (const T*)e.p, *matrix = (const T*)e.matrix;
-    const int64_t begin = 2 * range.begin, end = 2 * range.end;
-    const auto over = [&](Range pairs, const auto& add) {
-        for (int64_t slot = 2 * pairs.begin; slot < 2 * pairs.end; ++slot)
-            for (int64_t i = e.pair_starts[(slot >> 1) + 1] - 1; i > e.pair_starts[slot >> 1]; --i)
-                add(slot, e.pair_cols[2 * i + (slot & 1)], matrix + 24 * i + 4 * (slot & 1));
-    };
-    over({std::max<int64_t>(range.begin - e.reach, 0), range.begin}, [&](int64_t slot, int64_t col, const T* m) {
-        if (col < begin || col >= end) return;
-        const V4 own = load<V4>(p + 4 * slot);
-        store(q + 4 * col, load<V4>(q + 4 * col) + load<V4>(m) * own[0] + load<V4>(m + 8) * own[1] + load<V4>(m + 16) * own[2]);
-    });
-    over({std::max(range.begin, range.end - e.reach), range.end}, [&](int64_t slot, int64_t col, const T* m) {
-        if (col < end) return;
-        const V4 other = load<V4>(p + 4 * col);
+    const int32_t *starts = e.outer_starts + 2 * part, *outer = e.outer_blocks + 3 * (int64_t)starts[0];
+    for (int64_t i = starts[0]; i < starts[1]; ++i, outer += 3) {
+        const V4 other = load<V4>(p + 4 * (int64_t)outer[1]);
+        const T* m = matrix + outer[2];
+        T* own = q + 4 * (int64_t)outer[0];
+        store(own, load<V4>(own) + load<V4>(m) * other[0] + load<V4>(m + 8) * other[1] + load<V4>(m + 16) * other[2]);
+    }
+    for (int64_t i = starts[1]; i < starts[2]; ++i, outer += 3) {
+        const V4 other = load<V4>(p + 4 * (int64_t)outer[1]);
+        const T* m = matrix + outer[2];
         const V4 a = load<V4>(m) * other, b = load<V4>(m + 8) * other, c = load<V4>(m + 16) * other;
-        store(q + 4 * slot, load<V4>(q + 4 * slot) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
-    });
+        T* own = q + 4 * (int64_t)outer[0];
+        store(own, load<V4>(own) + V4{a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], T(0)});
+    }
 }
 
 // z = B r of a pair, in the place of q; adds r . z.
@@ -968,9 +980,8 @@ template <class T> double multiply(const Engine& e, T share) {
     for_parts(e.parts, [&](int64_t part) { sweep_back<T>(e, part, share); });
     couple_cloth<T>(e);
     return sum_parts(e, [&](int64_t part) {
-        const Range range = pairs_of(e, part);
-        if (e.parts > 1) couple_part<T>(e, range);
-        return sweep_on<T, false>(e, range);
+        if (e.parts > 1) couple_part<T>(e, part);
+        return sweep_on<T, false>(e, pairs_of(e, part));
     });
 }
 
@@ -1096,7 +1107,7 @@ template <class T> void solve_by_blocks(Engine& e, int64_t most) {
     for (int64_t iteration = 0; iteration < most && rz > 0.0; ++iteration) {
         for_parts(e.parts, [&](int64_t part) { multiply_part<T>(e, pairs_of(e, part)); });
         couple_cloth<T>(e);
-        if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, pairs_of(e, part)); });
+        if (e.parts > 1) for_parts(e.parts, [&](int64_t part) { couple_part<T>(e, part); });
         const double curvature = sum_pairs([&](int64_t pair, D4& sum) { add_product(sum, load<V8>(p + 8 * pair), load<V8>(q + 8 * pair)); });
         if (!(curvature > 0.0)) break;
         const T length = (T)(rz / curvature);
@@ -1214,21 +1225,24 @@ template <class T> void prepare_points(const Engine& e, const Points& set) {
 // What stops vertices at walls on the way of a step: give (3), compliance, depth at the start, 1 where it acts.
 template <class T> void prepare_path(const Engine& e) {
     const T* inverse = (const T*)e.inverse;
-    for (int64_t w = 0; w < e.num_walls; ++w)
-        for (int64_t row = 0; row < e.num_rows; ++row) {
-            const double *pos = e.pos + 4 * row, *step = e.direction + 4 * row, *normal = e.walls[w].normal + 3 * row;
-            const double end[3] = {pos[0] + step[0], pos[1] + step[1], pos[2] + step[2]};
-            const double here = depth_of(e.walls[w], row, pos), there = depth_of(e.walls[w], row, end);
-            double* stop = e.path + 8 * (w * e.num_rows + row);
-            stop[5] = here > 0.0 || there > 0.0;
-            if (stop[5] == 0.0) continue;
-            for (int k = 0; k < 3; ++k) {
-                const T* m = own_block(e, inverse, row) + k;
-                stop[k] = (double)m[0] * normal[0] + (double)m[8] * normal[1] + (double)m[16] * normal[2];
+    for_parts(e.parts, [&](int64_t part) {
+        const Range rows = rows_of(e, part);
+        for (int64_t w = 0; w < e.num_walls; ++w)
+            for (int64_t row = rows.begin; row < rows.end; ++row) {
+                const double *pos = e.pos + 4 * row, *step = e.direction + 4 * row, *normal = e.walls[w].normal + 3 * row;
+                const double end[3] = {pos[0] + step[0], pos[1] + step[1], pos[2] + step[2]};
+                const double here = depth_of(e.walls[w], row, pos), there = depth_of(e.walls[w], row, end);
+                double* stop = e.path + 8 * (w * e.num_rows + row);
+                stop[5] = here > 0.0 || there > 0.0;
+                if (stop[5] == 0.0) continue;
+                for (int k = 0; k < 3; ++k) {
+                    const T* m = own_block(e, inverse, row) + k;
+                    stop[k] = (double)m[0] * normal[0] + (double)m[8] * normal[1] + (double)m[16] * normal[2];
+                }
+                stop[3] = dot3(stop, normal);
+                stop[4] = here > 0.0 ? here : 0.0;
             }
-            stop[3] = dot3(stop, normal);
-            stop[4] = here > 0.0 ? here : 0.0;
-        }
+    });
     for (int64_t s = 0; s < e.num_points; ++s) prepare_points<T>(e, e.points[s]);
 }
 
@@ -1262,20 +1276,25 @@ void walk_points(const Engine& e, const Points& set) {
 
 void walk(const Engine& e, double length) {
     const double step = length / e.dt_sq;
-    for (int64_t row = 0; row < e.num_rows; ++row)
-        for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + step * e.direction[4 * row + k];
-    for (int64_t w = 0; w < e.num_walls; ++w) {
-        const Wall& wall = e.walls[w];
-        for (int64_t row = 0; row < e.num_rows; ++row) {
-            const double* stop = e.path + 8 * (w * e.num_rows + row);
-            if (stop[5] == 0.0) continue;
-            double *acc = e.trial_acc + 4 * row, pos[3];
-            for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * row + k] + e.dt_sq * acc[k];
-            const double push = contact_push(wall.weight, stop[4], depth_of(wall, row, pos), stop[3]) / e.dt_sq;
-            if (!(push > 0.0)) continue;
-            for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
+    for_parts(e.parts, [&](int64_t part) {
+        const Range rows = rows_of(e, part);
+        for (int64_t row = rows.begin; row < rows.end; ++row)
+            for (int k = 0; k < 3; ++k) e.trial_acc[4 * row + k] = e.acc[4 * row + k] + step * e.direction[4 * row + k];
+        for (int64_t w = 0; w < e.num_walls; ++w) {
+            const Wall& wall = e.walls[w];
+            for (int64_t row = rows.begin; row < rows.end; ++row) {
+                const double* stop = e.path + 8 * (w * e.num_rows + row);
+                if (stop[5] == 0.0) continue;
+                double *acc = e.trial_acc + 4 * row, pos[3];
+                for (int k = 0; k < 3; ++k) pos[k] = e.base[3 * row + k] + e.dt_sq * acc[k];
+                const double push = contact_push(wall.weight, stop[4], depth_of(wall, row, pos), stop[3]) / e.dt_sq;
+                if (!(push > 0.0)) continue;
+                for (int k = 0; k < 3; ++k) acc[k] += push * stop[k];
+            }
         }
-    }
+        if (!e.num_points) place(e, e.trial_acc, e.trial_pos, rows);
+    });
+    if (!e.num_points) return;
     for (int64_t s = 0; s < e.num_points; ++s) walk_points(e, e.points[s]);
     place(e, e.trial_acc, e.trial_pos);
 }

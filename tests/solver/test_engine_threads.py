@@ -81,6 +81,44 @@ def test_contact_at_points_has_the_same_bits_in_any_number_of_parts(share, place
         assert np.array_equal(matrix, found[0][1])
 
 
+@pytest.mark.parametrize("place", PLACES)
+def test_ways_along_contact_at_points_are_those_of_one_part(share, place):
+    potential, problem, _ = pressed(place)
+    share(1)
+    expected, phi = after(potential, problem, COMPILED, 3)
+    for parts in PARTS:
+        share(parts)
+        found, shared = after(potential, problem, COMPILED, 3)
+        assert float((found - expected).norm()) <= 1e-4 * float((expected - problem.state.pos).norm())
+        assert shared == pytest.approx(phi, rel=1e-5, abs=1e-9)
+
+
+def test_blocks_between_parts_are_those_whose_ends_are_in_two(share):
+    """Each twice: for the part of its row, and turned for that of its column."""
+    problem = touching_sheet()
+    for parts in PARTS:
+        share(parts)
+        scene = model_at(problem, default_potential(), states(problem)["near"], wide=False)
+        pairs, (outer, starts) = scene.tables.pairs, (scene.array(name) for name in ("outer_blocks", "outer_starts"))
+        count = len(pairs.starts) - 1
+        part = np.searchsorted([count * i // parts for i in range(1, parts)], np.arange(2 * count) // 2, side="right")
+        found = set()
+        for group in range(2 * parts):
+            for own, other, place in outer[starts[group] : starts[group + 1]].tolist():
+                row, col = (other, own) if group % 2 == 0 else (own, other)
+                block = place // 24
+                assert pairs.starts[row // 2] < block < pairs.starts[row // 2 + 1]
+                assert place % 24 == 4 * (row % 2)
+                assert pairs.cols[block, row % 2] == col
+                assert part[own] == group // 2 != part[other]
+                found.add((group % 2, row, col))
+        rows = np.repeat(np.arange(count), np.diff(pairs.starts))
+        both = [(2 * row + half, col) for half in (0, 1) for row, col in zip(rows, pairs.cols[:, half], strict=True)]
+        between = {(int(row), int(col)) for row, col in both if pairs.row[row] >= 0 and part[row] != part[col]}
+        assert found == {(turned, row, col) for turned in (0, 1) for row, col in between}
+        assert len(outer) == starts[-1] == len(found) > 0
+
+
 def test_the_linear_solver_in_float64_does_not_depend_on_the_parts(share):
     """What columns behind a part are given arrives: a lost block would show in the first digit."""
     problem, found, moved = touching_sheet(), [], []

@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from hood import native
-from hood.native.arguments import COUNT, POINTER, REAL, fields
+from hood.native.arguments import COUNT, POINTER, REAL, fields, num_parts
 from hood.native.build import CROSSING_FLAGS, BuildError, build
 
 _SOURCE = Path(native.__file__).with_name("crossing.cpp")
 #: Rows that there is room for at first; more are asked for where these do not suffice.
 _ROOM = 4096
+#: Triangles of a part that is worth a thread.
+_FACES = 1000
 #: Triangles of a leaf, as in the source.
 _WIDE = 8
 
@@ -112,11 +114,12 @@ def find_crossings(first: Eights, pos: np.ndarray, second: Eights, other_pos: np
     assert lib is not None
     places = _double(pos), _double(other_pos)
     meshes = ctypes.byref(first.at(places[0])), ctypes.byref(second.at(places[1]))
+    parts = num_parts(len(first.faces), _FACES)
     room = [_ROOM] * 3
     while True:
         tables = [np.empty((count, width), np.int64) for count, width in zip(room, (2, 3, 3), strict=True)]
         rows = _Rows((COUNT * 3)(*room), (COUNT * 3)(), *(table.ctypes.data for table in tables))
-        lib.crossing_find(*meshes, COUNT(first is second), REAL(touch), ctypes.byref(rows))
+        lib.crossing_find(*meshes, COUNT(first is second), REAL(touch), COUNT(parts), ctypes.byref(rows))
         found = list(rows.found)
         if all(count <= most for count, most in zip(found, room, strict=True)):
             return [table[:count] for table, count in zip(tables, found, strict=True)]

@@ -76,6 +76,7 @@ class _Engine(ctypes.Structure):
         *fields("modelled cg_used parts reach", COUNT),
         *fields("border outside border_blocks", POINTER),
         *fields("num_border", COUNT),
+        *fields("outer_blocks outer_starts", POINTER),
         *fields("layers vertex_of_scene", POINTER),
         *fields("kept eased", REAL),
         *fields("layer_grips others", POINTER),

@@ -8,6 +8,7 @@ of eight by elements that weigh nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -73,26 +74,37 @@ class Tables:
         """Blocks of the longest row."""
         return int(np.diff(self.row_starts).max(initial=0))
 
+    @cached_property
+    def place(self) -> np.ndarray:
+        """Where blocks (K,) begin in the compiled solver's matrix."""
+        first = np.repeat(self.pairs.starts[self.pairs.slot // 2] - self.row_starts[:-1], np.diff(self.row_starts))
+        half = np.repeat(self.pairs.slot % 2, np.diff(self.row_starts))
+        return np.asarray(24 * (np.arange(len(self.cols)) + first) + 4 * half, np.int32)
+
     def blocks(self, matrix: np.ndarray) -> np.ndarray:
         """Blocks (K, 3, 3) of the compiled solver's ``matrix``, in the order of :attr:`cols`."""
-        place = np.repeat(self.pairs.starts[self.pairs.slot // 2] - self.row_starts[:-1], np.diff(self.row_starts))
-        half = np.repeat(self.pairs.slot % 2, np.diff(self.row_starts))
-        return matrix.reshape(-1, 3, 2, 4)[np.arange(len(self.cols)) + place, :, half, :3]
+        return matrix.reshape(-1)[self.place[:, None, None] + np.array([[0], [8], [16]]) + np.arange(3)]
 
     def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
         """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
-        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``. Parts are those of ``range_of``
-        in ``hood/native/threads.h``."""
-        size, pairs = self.num_rows, len(self.pairs.starts) - 1
+        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``; the blocks between parts,
+        ``outer_blocks`` (N, 3) int32, and where those of a part begin, ``outer_starts`` (2 parts + 1,) int32. Parts are those of
+        ``range_of`` in ``hood/native/threads.h``."""
+        size, pairs, slot = self.num_rows, len(self.pairs.starts) - 1, self.pairs.slot
         rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
-        part = np.searchsorted(pairs * np.arange(1, parts) // parts, self.pairs.slot // 2, side="right")
+        part = np.searchsorted(pairs * np.arange(1, parts) // parts, slot // 2, side="right")
         both, other = np.concatenate([rows, cols]), np.tile(part[rows] != part[cols], 2)
         outside = np.bincount(both, other, size) / np.maximum(np.bincount(both, minlength=size) - 2, 1)  # but the diagonal
-        border = np.flatnonzero(outside)
+        border, outer = np.flatnonzero(outside), np.flatnonzero(part[rows] != part[cols])
+        ends, place = slot[np.stack([cols[outer], rows[outer]])], self.place[outer]
+        blocks = np.concatenate([np.column_stack([*ends, place]), np.column_stack([*ends[::-1], place])])
+        group = np.concatenate([2 * part[cols[outer]], 2 * part[rows[outer]] + 1])
         return {
             "border": border.astype(np.int32),
             "outside": outside[border],
             "border_blocks": np.zeros(24 * len(border), kind),
+            "outer_blocks": blocks[np.argsort(group, kind="stable")].astype(np.int32),
+            "outer_starts": np.searchsorted(np.sort(group), np.arange(2 * parts + 1)).astype(np.int32),
         }
 
 

@@ -39,6 +39,20 @@ def test_tables_are_those_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -
     assert depth == pytest.approx(skin_depth(pos, faces, np.nan_to_num(ball), ball_faces, found), abs=1e-12)
 
 
+def test_what_is_found_does_not_depend_on_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which all ask for the normals of the same triangles: these are made once."""
+    pos, faces = crumpled(30, 5)
+    ball, ball_faces = sphere(4, 0.4)
+    expected, own = crossings(pos, faces, ball, ball_faces), self_crossings(pos, faces)
+    for threads in (2, 3, 64):
+        monkeypatch.setattr(compiled, "num_parts", lambda count, least, threads=threads: threads)
+        for _ in range(5):
+            for table, other in zip(crossings(pos, faces, ball, ball_faces), expected, strict=True):
+                np.testing.assert_array_equal(table, other)
+            np.testing.assert_array_equal(self_crossings(pos, faces), own)
+        assert len(crossings(pos, faces, ball, ball_faces[:0]).pairs) == 0
+
+
 def test_more_rows_than_there_is_room_for_are_all_found(monkeypatch: pytest.MonkeyPatch) -> None:
     pos, faces = crumpled(20, 0)
     expected = self_crossings(pos, faces)
