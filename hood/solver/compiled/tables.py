@@ -88,8 +88,8 @@ class Tables:
     def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
         """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
         neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``; the blocks between parts,
-        ``outer_blocks`` (N, 3) int32, and where those of a part begin, ``outer_starts`` (2 parts + 1,) int32. Parts are those of
-        ``range_of`` in ``hood/native/threads.h``."""
+        ``outer_blocks`` (N, 3) int32, and where those of a part begin, ``outer_starts`` (2 parts + 1,) int32. Parts are
+        those of ``range_of`` in ``hood/native/threads.h``."""
         size, pairs, slot = self.num_rows, len(self.pairs.starts) - 1, self.pairs.slot
         rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
         part = np.searchsorted(pairs * np.arange(1, parts) // parts, slot // 2, side="right")
