@@ -13,6 +13,15 @@
 #include "lanes.h"
 #include "vector.h"
 
+extern "C" {
+
+// Rows that were found, unique and sorted; where there are more than there is room for, they are counted alone.
+struct Rows {
+    int64_t room[3], found[3];
+    int64_t *pairs, *first_edges, *second_edges;  // (., 2), (., 3), (., 3)
+};
+}
+
 namespace {
 
 constexpr int EDGE[3][2] = {{0, 1}, {1, 2}, {0, 2}};  // of a triangle whose corners ascend
@@ -220,9 +229,13 @@ struct Search {
     const Levels levels;
     const int64_t same;
     const double touch;
-    std::vector<int64_t>* found;  // rows of pairs, of edges of the first and of edges of the second
+    Rows& rows;
 
-    void put(int which, std::initializer_list<int64_t> row) const { found[which].insert(found[which].end(), row); }
+    // Threads share the tables, which are sorted afterwards; rows that there is no room for are counted alone.
+    void put(int which, int64_t* table, std::initializer_list<int64_t> row) const {
+        const int64_t place = __atomic_fetch_add(rows.found + which, 1, __ATOMIC_RELAXED);
+        if (place < rows.room[which]) std::copy(row.begin(), row.end(), table + (int64_t)row.size() * place);
+    }
 
     void examine(const Triangle& a, const Triangle& b) const {
         int side[3], other_side[3], turn[3][3];
@@ -237,14 +250,14 @@ struct Search {
             const int *ends = EDGE[i], here = side[ends[0]] * side[ends[1]], there = other_side[ends[0]] * other_side[ends[1]];
             if (here < 0 && inside(turn[i][0], turn[i][1], turn[i][2])) {
                 crossed = true;
-                put(1, {a.vertex[ends[0]], a.vertex[ends[1]], b.number});
+                put(1, rows.first_edges, {a.vertex[ends[0]], a.vertex[ends[1]], b.number});
             }
             if (there < 0 && inside(turn[0][i], turn[1][i], turn[2][i])) {
                 crossed = true;
-                put(2, {b.vertex[ends[0]], b.vertex[ends[1]], a.number});
+                put(2, rows.second_edges, {b.vertex[ends[0]], b.vertex[ends[1]], a.number});
             }
         }
-        if (crossed) put(0, {a.number, b.number});
+        if (crossed) put(0, rows.pairs, {a.number, b.number});
     }
 
     void compare(int64_t leaf, int64_t other) const {
@@ -275,12 +288,6 @@ struct Search {
 
 extern "C" {
 
-// Rows that were found, unique and sorted; where there are more than there is room for, they are counted alone.
-struct Rows {
-    int64_t room[3], found[3];
-    int64_t *pairs, *first_edges, *second_edges;  // (., 2), (., 3), (., 3)
-};
-
 // Everything about a mesh that depends on the topology, from centres (F, 3) of the faces; ``order`` holds their numbers.
 void crossing_order(Eights* e, const double* centre) {
     order_leaves(e->order, (int32_t)e->num_faces, LANES, centre);
@@ -296,33 +303,20 @@ void crossing_order(Eights* e, const double* centre) {
 // Crossings of two meshes, or of pairs of one mesh's faces without a common vertex, the smaller number first (``same``). The leaves
 // of the first mesh are looked at in parts, by threads; what is found does not depend on it.
 void crossing_find(const Eights* first, const Eights* second, int64_t same, double touch_share, int64_t parts, Rows* rows) {
-    constexpr int WIDTH[3] = {2, 3, 3};
     constexpr int64_t IN_TURN = 4;  // leaves that a part takes before it is the next one's turn
-    std::vector<std::vector<int64_t>> found(3 * parts);
-    if (first->num_leaves && second->num_leaves) {
-        double origin[3], touch;
-        locate(*first, *second, origin, &touch);
-        touch *= touch_share;
-        place(*first, origin, parts);
-        if (!same) place(*second, origin, parts);
-        for_parts(parts, [&](int64_t part) {
-            const Search search{*first, *second, Levels(second->num_leaves), same, touch, &found[3 * part]};
-            for (int64_t begin = IN_TURN * part; begin < first->num_leaves; begin += IN_TURN * parts)
-                for (int64_t leaf = begin; leaf < std::min(begin + IN_TURN, first->num_leaves); ++leaf) search.look_at(leaf);
-        });
-    }
-    int64_t* const table[3] = {rows->pairs, rows->first_edges, rows->second_edges};
-    bool fits = true;
-    for (int k = 0; k < 3; ++k) {
-        rows->found[k] = 0;
-        for (int64_t part = 0; part < parts; ++part) rows->found[k] += (int64_t)found[3 * part + k].size() / WIDTH[k];
-        fits &= rows->found[k] <= rows->room[k];
-    }
-    if (!fits) return;
-    for (int k = 0; k < 3; ++k) {
-        int64_t* end = table[k];
-        for (int64_t part = 0; part < parts; ++part) end = std::copy(found[3 * part + k].begin(), found[3 * part + k].end(), end);
-    }
+    for (int k = 0; k < 3; ++k) rows->found[k] = 0;
+    if (!first->num_leaves || !second->num_leaves) return;
+    double origin[3], touch;
+    locate(*first, *second, origin, &touch);
+    place(*first, origin, parts);
+    if (!same) place(*second, origin, parts);
+    const Search search{*first, *second, Levels(second->num_leaves), same, touch * touch_share, *rows};
+    for_parts(parts, [&](int64_t part) {
+        for (int64_t begin = IN_TURN * part; begin < first->num_leaves; begin += IN_TURN * parts)
+            for (int64_t leaf = begin; leaf < std::min(begin + IN_TURN, first->num_leaves); ++leaf) search.look_at(leaf);
+    });
+    for (int k = 0; k < 3; ++k)
+        if (rows->found[k] > rows->room[k]) return;
     sort_rows<2>(rows->pairs, rows->found), sort_rows<3>(rows->first_edges, rows->found + 1), sort_rows<3>(rows->second_edges, rows->found + 2);
 }
 

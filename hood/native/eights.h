@@ -20,7 +20,7 @@ struct Eights {
     double* normal;         // (L, 3, 8) unit normals, zero without an area; of leaves that this call needed
     double* boxes;          // (L, 6, 8) m, least and greatest corners
     double* groups;         // (G, 6, 8) m, those of eight leaves, then of eight of these, level after level
-    uint8_t* has_normals;   // (L)
+    uint8_t* has_normals;   // (L) whether they are made, see normals()
 };
 }
 
@@ -163,11 +163,12 @@ inline void place(const Eights& e, const double* origin, int64_t parts) {
 inline const double* normals(const Eights& e, int64_t leaf) {
     enum : uint8_t { NONE, BEGUN, MADE };
     double* normal = e.normal + 3 * LANES * leaf;
-    uint8_t *state = e.has_normals + leaf, none = NONE;
-    if (__atomic_load_n(state, __ATOMIC_ACQUIRE) == MADE) return normal;
-    if (!__atomic_compare_exchange_n(state, &none, BEGUN, false, __ATOMIC_ACQUIRE, __ATOMIC_ACQUIRE)) {
-        while (__atomic_load_n(state, __ATOMIC_ACQUIRE) != MADE) pause_briefly();
-        return normal;
+    uint8_t* state = e.has_normals + leaf;
+    while (true) {
+        uint8_t now = __atomic_load_n(state, __ATOMIC_ACQUIRE);
+        if (now == MADE) return normal;
+        if (now == NONE && __atomic_compare_exchange_n(state, &now, BEGUN, false, __ATOMIC_ACQUIRE, __ATOMIC_ACQUIRE)) break;
+        std::this_thread::yield();
     }
     for (int at = 0; at < LANES; at += AT_ONCE) {
         const double* corner = e.corner + 9 * LANES * leaf + at;

@@ -43,8 +43,8 @@ inline double point_triangle(Vec p, Vec a, Vec b, Vec c, double* weight) {
     return best;
 }
 
-// The same for two segments. Of edges that are parallel but for rounding, the solution inside is anywhere: an end that is nearer
-// counts.
+// The same for two segments. Of edges that are parallel but for rounding, the solution inside is anywhere, and below an angle of 1e-4 not
+// exact enough for edges that touch: an end that is nearer counts, as in segment_segment_sq.
 inline double segment_segment(Vec a, Vec b, Vec c, Vec d, double* weight) {
     const Vec u = b - a, v = d - c, w = a - c;
     const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), uw = dot(u, w), vw = dot(v, w), det = uu * vv - uv * uv;
@@ -55,7 +55,7 @@ inline double segment_segment(Vec a, Vec b, Vec c, Vec d, double* weight) {
             const Vec gap = w + s * u - t * v;
             weight[0] = 1.0 - s, weight[1] = s, weight[2] = t - 1.0, weight[3] = -t;
             best = dot(gap, gap);
-            if (det > 1e-12 * uu * vv) return best;
+            if (det > 1e-8 * uu * vv) return best;
         }
     }
     const Vec end[4] = {a, b, c, d};

@@ -539,7 +539,7 @@ void vertex_energies(const Engine& e, const double* pos, const double* acc, Rang
 void energy(const Engine& e, const double* pos, const double* acc, bool model, double* phi, double* noise) {
     double sum = 0.0, size = 0.0;
     const auto add = [&](double part) { sum += part, size += std::fabs(part); };
-    const int64_t terms = 2 + e.num_walls + e.num_grips, stride = (terms + 7) / 8 * 8;  // a line of the cache, or several
+    const int64_t terms = 2 + e.num_walls + e.num_grips, stride = (terms + 15) / 8 * 8;  // a line of the cache apart
     std::vector<double> vertices(stride * e.parts);
     Sums<double> faces, hinges;
     for_parts(e.parts, [&](int64_t part) {

@@ -243,13 +243,13 @@ def minimize_held_off(
         report: of ``pos``, which may have missed the minimum; None where it is known to be one.
     """
     best, rounds, spent = HeldOff(problem, pos, report, 0, 0), 0, 0
-    again = problem.with_held_off(pos)  # where one minimum has been missed at most
+    again = problem.with_held_off(pos) if MOST_RAISED else problem  # where one minimum has been missed at most
     if again is problem:
         return best
     least = problem.num_in_skin(pos)
     misses = torch.zeros_like(least) if report is None else (~report.converged).to(least)
     unsolved = misses > 0
-    while again is not problem and rounds < MOST_RAISED:
+    while again is not problem:
         problem = again
         pos, found = minimize(potential, problem, pos, settings)
         pos = torch.where(torch.isfinite(pos), pos, best.pos)  # what is no number is missed, and no place to go on from
@@ -263,8 +263,7 @@ def minimize_held_off(
         unsolved = unsolved & ~better
         least = torch.where(better, count, least)
         best = _by_scene(better, HeldOff(problem, pos, found, 0, 0), best)
-        if rounds < MOST_RAISED:
-            again = problem.with_held_off(pos, misses < MOST_MISSES)
+        again = problem.with_held_off(pos, misses < MOST_MISSES) if rounds < MOST_RAISED else problem
     return best._replace(rounds=rounds, iterations=spent)
 
 

@@ -40,12 +40,13 @@ def test_tables_are_those_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_is_found_does_not_depend_on_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which all ask for the normals of the same triangles: these are made once."""
+    """Nor the room that there is at first."""
     pos, faces = crumpled(30, 5)
     ball, ball_faces = sphere(4, 0.4)
     expected, own = crossings(pos, faces, ball, ball_faces), self_crossings(pos, faces)
-    for threads in (2, 3, 64):
+    for threads, room in ((2, 4096), (3, 1), (64, 50)):
         monkeypatch.setattr(compiled, "num_parts", lambda count, least, threads=threads: threads)
+        monkeypatch.setattr(compiled, "_ROOM", room)
         for _ in range(5):
             for table, other in zip(crossings(pos, faces, ball, ball_faces), expected, strict=True):
                 np.testing.assert_array_equal(table, other)
