@@ -67,7 +67,7 @@ def test_a_place_that_only_a_bent_way_leads_to_is_where_the_way_begins() -> None
     pos, faces = grid(9, 9, 0.3)
     rest, both = np.concatenate([pos, pos]), np.concatenate([faces, faces + len(pos)])
     down = np.zeros_like(rest)
-    down[len(pos) :, 1] = -0.9
+    down[len(pos) :, 1] = -5.0
     cloth = build_cloth(rest, both, Material(), dtype=torch.float64)
     start = np.concatenate([pos, pos + [0.013, 0.01, 0.008]])
     problem = LAYERED.prepare(make_problem(cloth, start, down))
