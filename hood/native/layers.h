@@ -169,7 +169,7 @@ struct Layers {
 
     static constexpr int64_t MOST_PAIRS = 4000000;
     static constexpr int64_t MOST_LOOKS = 300;  // at pairs of faces, for each face: beyond it the cloth is torn
-    static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance
+    static constexpr double SLACK = 1e-9;       // m, more than rounding makes of a distance of any but nearly parallel edges: 1e-7
     static constexpr int64_t PARTS = 8;         // of a search, for each thread
     static constexpr size_t FEW = 16;           // at most one of so many vertices is looked for alone
 

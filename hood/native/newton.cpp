@@ -109,8 +109,8 @@ struct Engine {
     const double* outside;          // (K) which share of their neighbours these are
     void* border_blocks;            // (K, 24)
     int64_t num_border;
-    // Blocks between rows of two parts: slots of a row and of the other one, and where the block is in the matrix. Those that are
-    // to be transposed, of rows of the first part, then the others, and so on; where they begin (2 parts + 1).
+    // (N, 3) blocks between rows of two parts: the slot that is added to, the slot of the other row, where the block is in the matrix.
+    // Of every part those that act transposed, then those that act as they are; where these groups begin (2 parts + 1).
     const int32_t *outer_blocks, *outer_starts;
     // Cloth near cloth; none where there is no such term.
     LayerView* layers;

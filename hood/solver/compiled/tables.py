@@ -76,7 +76,7 @@ class Tables:
 
     @cached_property
     def place(self) -> np.ndarray:
-        """Where blocks (K,) begin in the compiled solver's matrix."""
+        """(K,) int32: which number of the compiled solver's matrix is the first of each block."""
         first = np.repeat(self.pairs.starts[self.pairs.slot // 2] - self.row_starts[:-1], np.diff(self.row_starts))
         half = np.repeat(self.pairs.slot % 2, np.diff(self.row_starts))
         return np.asarray(24 * (np.arange(len(self.cols)) + first) + 4 * half, np.int32)
@@ -87,9 +87,10 @@ class Tables:
 
     def border(self, parts: int, kind: type) -> dict[str, np.ndarray]:
         """Where rows in so many parts have neighbours in other parts: these rows, ``border`` (K,) int32, which share of their
-        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``; the blocks between parts,
-        ``outer_blocks`` (N, 3) int32, and where those of a part begin, ``outer_starts`` (2 parts + 1,) int32. Parts are
-        those of ``range_of`` in ``hood/native/threads.h``."""
+        neighbours is ``outside`` (K,), and room for ``border_blocks`` (24 K,) of a ``kind``. The blocks between parts,
+        ``outer_blocks`` (N, 3) int32: slots of a row and of the other one, and :attr:`place`; of every part those that act
+        transposed, then those that act as they are, beginning at ``outer_starts`` (2 parts + 1,) int32. Parts are those of
+        ``range_of`` in ``hood/native/threads.h``."""
         size, pairs, slot = self.num_rows, len(self.pairs.starts) - 1, self.pairs.slot
         rows, cols = np.repeat(np.arange(size), np.diff(self.row_starts)), self.cols
         part = np.searchsorted(pairs * np.arange(1, parts) // parts, slot // 2, side="right")
